@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use schema::Failure;
-use tools::configure::{News, Order, configure};
+use tools::configure::{ConfigureEvent, ConfigureRequest, configure};
 use tools::probe::source;
 
 use super::Everywhere;
@@ -31,7 +31,7 @@ pub(crate) const CONSENT: &str = "A person must confirm. If stdin or stderr is n
 
 impl Configure {
     pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
-        let order = Order {
+        let request = ConfigureRequest {
             source: source(&self.port)?,
             places: everywhere.places()?,
             settings: self.settings.clone(),
@@ -39,11 +39,11 @@ impl Configure {
         };
         let json = everywhere.json;
         let mut progress = Progress::new();
-        let outcome = configure(&order, stop, &mut |news| match news {
-            News::Looking(rate) => progress.show(&format!("looking at {rate} Bd")),
-            News::Doing(what) => progress.show(what),
-            News::Asking => progress.clear(),
-            News::Difference(difference) => {
+        let outcome = configure(&request, stop, &mut |news| match news {
+            ConfigureEvent::Searching(rate) => progress.show(&format!("looking at {rate} Bd")),
+            ConfigureEvent::Step(what) => progress.show(what),
+            ConfigureEvent::Asking => progress.clear(),
+            ConfigureEvent::Difference(difference) => {
                 progress.clear();
                 crate::say(&if json { crate::line(difference) } else { difference.to_string() });
                 // The person who confirms must see it, even if stdout is redirected.
@@ -51,7 +51,7 @@ impl Configure {
                     crate::complain(&difference.to_string());
                 }
             }
-            News::Configured(configured) => {
+            ConfigureEvent::Configured(configured) => {
                 progress.clear();
                 crate::say(&if json { crate::line(configured) } else { configured.to_string() });
             }

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use clap::Args;
 use config::{Config, Gateway};
 use schema::Failure;
-use tools::doctor::{Bridge, Subjects, System, examine};
+use tools::doctor::{Bridge, CheckTargets, System, run_checks};
 use tools::probe::source;
 
 use super::{Everywhere, Run};
@@ -37,7 +37,7 @@ impl Doctor {
         let is_said = !(sources.files.is_empty() && sources.links.is_empty() && sources.set.is_empty());
         let read = sources.read();
         let gateway = Gateway::of(&read);
-        let subjects = Subjects {
+        let targets = CheckTargets {
             ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
             config: is_said.then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
             gateway: gateway.clone().unwrap_or_default(),
@@ -58,7 +58,7 @@ impl Doctor {
                 written = crate::print(text);
             }
         };
-        let outcome = examine(&subjects, stop, &mut |finding| {
+        let outcome = run_checks(&targets, stop, &mut |finding| {
             if everywhere.json {
                 return say(&crate::line(finding));
             }

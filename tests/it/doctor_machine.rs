@@ -14,7 +14,7 @@ use crate::testkit::{
 };
 use config::Gateway;
 use shm::Domain;
-use tools::doctor::{Bridge, Subjects, System, examine};
+use tools::doctor::{Bridge, CheckTargets, System, run_checks};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
@@ -84,7 +84,7 @@ fn laid_out(env: &TestEnv) -> Findings {
 
 /// All findings, including the ports of this machine and the adapters of the made-up one.
 fn with_ports(env: &TestEnv) -> Findings {
-    let subjects = Subjects {
+    let targets = CheckTargets {
         ports: Vec::new(),
         config: None,
         gateway: Gateway { interface: Some("lo".to_owned()), ..Gateway::default() },
@@ -97,7 +97,7 @@ fn with_ports(env: &TestEnv) -> Findings {
     let mut lines = Vec::new();
     let mut tell =
         |finding: &tools::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
-    let _ = examine(&subjects, &AtomicBool::new(false), &mut tell);
+    let _ = run_checks(&targets, &AtomicBool::new(false), &mut tell);
     Findings::in_lines(lines)
 }
 

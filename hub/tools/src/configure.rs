@@ -1,18 +1,22 @@
 //! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a
 //! person, writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
-
-mod ask;
-mod settings;
+//!
+//! [`ask_person`] is the only place that creates consent: nothing is written into a scanner unless a person has typed
+//! `yes`.
 
 use std::fmt;
-use std::sync::atomic::AtomicBool;
+use std::io::{IsTerminal, Write, stderr, stdin};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use lms_configure::eeprom::PowerOn;
-use lms_configure::{Change, Failing, Outcome, OwnedConfiguration, Plan, Step};
+use lms_configure::{Change, Consent, Failing, Outcome, OwnedConfiguration, Plan, Step};
 use port::{Source, clock};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::termios::{QueueSelector, tcflush};
 use scanhub_drivers::Inquiry;
 use scanhub_drivers::lms::configuration::{Item, availability_words};
 use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::variant::{Mode, Unit};
@@ -22,11 +26,10 @@ use shm::Domain;
 
 use crate::driver::{Procedure, drive};
 use crate::probe::{check_unused, hex, measuring, open, request_report};
-use settings::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, SettingsRequest, UNIT};
 
 /// The settings to change, and the port of the scanner.
 #[derive(Clone, Debug)]
-pub struct Order {
+pub struct ConfigureRequest {
     /// The port.
     pub source: Source,
     /// The locations in which a client would search for the domain of a hub, which may use the port.
@@ -39,20 +42,20 @@ pub struct Order {
 
 /// Progress and results to report.
 #[derive(Debug)]
-pub enum News<'a> {
+pub enum ConfigureEvent<'a> {
     /// The scanner is searched for at this rate.
-    Looking(u32),
+    Searching(u32),
     /// One value that would change.
     Difference(&'a Difference),
     /// All differences were reported, and a person must confirm them now.
     Asking,
     /// The step that runs now, as text.
-    Doing(&'static str),
+    Step(&'static str),
     /// The change succeeded, or there was nothing to change.
     Configured(&'a Configured),
 }
 
-/// Carries out `order`; calls `tell` with progress and results.
+/// Carries out `request`; calls `tell` with progress and results.
 ///
 /// # Errors
 ///
@@ -63,16 +66,21 @@ pub enum News<'a> {
 /// - [`Kind::Usage`] if there is no terminal at which a person could confirm.
 /// - The kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`].
 /// - [`Kind::Failed`] with the state of the scanner, if the change failed or was not confirmed.
-pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>)) -> Result<(), Failure> {
-    let requested = SettingsRequest::parse(&order.settings)?;
-    let password = password(&order.password)?;
-    check_unused(&order.source, &order.places)?;
-    let (port, first) = open(&order.source, stop)?;
-    let rate = if let Source::Tcp { .. } = order.source { None } else { Some(first) };
+pub fn configure(
+    request: &ConfigureRequest,
+    stop: &AtomicBool,
+    tell: &mut dyn FnMut(ConfigureEvent<'_>),
+) -> Result<(), Failure> {
+    let requested = SettingsRequest::parse(&request.settings)?;
+    let password = parse_password(&request.password)?;
+    check_unused(&request.source, &request.places)?;
+    let (port, first) = open(&request.source, stop)?;
+    let rate = if let Source::Tcp { .. } = request.source { None } else { Some(first) };
     let inquiry = Inquiry::begin(rate, clock::now());
-    let report =
-        request_report(&port, first, inquiry, (&order.source, true), stop, |rate| tell(News::Looking(rate)))?;
-    let name = order.source.name();
+    let report = request_report(&port, first, inquiry, (&request.source, true), stop, |rate| {
+        tell(ConfigureEvent::Searching(rate))
+    })?;
+    let name = request.source.name();
     let Some(mut plan) = Plan::of(&report) else {
         return Err(Failure::new(
             Kind::Timeout,
@@ -84,19 +92,19 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let family = report.kind().and_then(Family::of_type);
     requested.apply(&mut plan, family, &report)?;
     if plan.is_empty() {
-        tell(News::Configured(&Configured::nothing(&name, &plan)));
+        tell(ConfigureEvent::Configured(&Configured::nothing(&name, &plan)));
         return Ok(());
     }
     let was_permanent = report.status().map(|status| status.has_permanent_baud());
     for difference in Difference::all(&name, &plan, family, was_permanent) {
-        tell(News::Difference(&difference));
+        tell(ConfigureEvent::Difference(&difference));
     }
-    tell(News::Asking);
-    let consent = ask::person(plan, stop)?;
+    tell(ConfigureEvent::Asking);
+    let consent = ask_person(plan, stop)?;
     // A scanner that streams has filled the input buffer in the meantime.
     port.discard_input(plan.baud.rate()).map_err(|error| lost_before_writing(&name, &error))?;
     let mut change = Change::new(consent, clock::now());
-    if let Source::Tcp { .. } = order.source {
+    if let Source::Tcp { .. } = request.source {
         change = change.behind_server();
     }
     let mut shown = None;
@@ -105,14 +113,14 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let mut procedure = Procedure::new(|change: &Change| {
         if shown != Some(change.step()) {
             shown = Some(change.step());
-            tell(News::Doing(describe_step(change.step())));
+            tell(ConfigureEvent::Step(describe_step(change.step())));
         }
         true
     });
     let result = drive(&port, &mut change, &mut procedure, &never_stop);
     result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;
     let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
-    tell(News::Configured(&configured));
+    tell(ConfigureEvent::Configured(&configured));
     Ok(())
 }
 
@@ -281,7 +289,7 @@ impl fmt::Display for Configured {
 }
 
 /// Parses the password of the installation mode.
-fn password(text: &str) -> Result<Password, Failure> {
+fn parse_password(text: &str) -> Result<Password, Failure> {
     let refuse = |_| {
         let message = format!("--password: {} characters", text.chars().count());
         Failure::new(Kind::Configuration, message, "a password has 8 ASCII characters, such as SICK_LMS")
@@ -321,7 +329,6 @@ fn describe_value(item: Item, bytes: &[u8], family: Option<Family>) -> String {
     if meaning.is_empty() { format!("{hex}h") } else { format!("{hex}h ({meaning})") }
 }
 
-/// Returns the failure of a change in `step`, with the state of the scanner.
 /// Returns the failure of a change in `step`, with the state of the scanner.
 fn failure(port: &str, plan: &Plan, outcome: &Outcome, step: Step, failing: Failing) -> Failure {
     let what = match (step, failing) {
@@ -370,3 +377,303 @@ fn lost_while_writing(port: &str, change: &Change, failure: &Failure) -> Failure
 
 /// Remedy for a scanner whose operating mode is unknown.
 const UNKNOWN_MODE: &str = "it may be in installation mode: scanhub run leaves it, or power it off and on";
+
+/// All settings that the command line requests.
+#[derive(Clone, Debug)]
+pub(crate) struct SettingsRequest(Vec<Setting>);
+
+#[derive(Clone, Debug, PartialEq)]
+enum Setting {
+    Unit(Unit),
+    Mode(Mode),
+    /// Level 1, 2 or 3.
+    Availability(u8),
+    Indices(bool),
+    Sensitivity(u8),
+    PowerOn(PowerOn),
+    Configuration(OwnedConfiguration),
+}
+
+impl SettingsRequest {
+    /// Parses settings of the form `KEY=VALUE`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] with key, value and the valid values if a setting is invalid, and
+    /// [`Kind::Usage`] if there is none.
+    pub(crate) fn parse(settings: &[String]) -> Result<SettingsRequest, Failure> {
+        if settings.is_empty() {
+            let keys: Vec<String> = KEYS.iter().map(|(key, values, _)| format!("{key}={values}")).collect();
+            return Err(Failure::new(Kind::Usage, "nothing to change", keys.join(", ")));
+        }
+        settings.iter().map(|setting| parse_setting(setting)).collect::<Result<_, _>>().map(SettingsRequest)
+    }
+
+    /// Applies every setting to `plan`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if this scanner does not support a setting.
+    fn apply(&self, plan: &mut Plan, family: Option<Family>, report: &Report) -> Result<(), Failure> {
+        let bits = |plan: &mut Plan, mask: u8, bits: u8| {
+            let byte = plan.new.bytes().get(AVAILABILITY).copied().unwrap_or_default();
+            plan.new.set(AVAILABILITY, byte & !mask | bits);
+        };
+        for setting in &self.0 {
+            match *setting {
+                Setting::Unit(unit) => plan.new.set(UNIT, unit.code()),
+                Setting::Mode(mode) => plan.new.set(MODE, mode.0),
+                Setting::Availability(3) => bits(plan, LEVEL_2 | LEVEL_3, LEVEL_3),
+                Setting::Availability(2) => bits(plan, LEVEL_2 | LEVEL_3, LEVEL_2),
+                Setting::Availability(_) => bits(plan, LEVEL_2 | LEVEL_3, 0),
+                Setting::Indices(is_on) => bits(plan, INDICES, if is_on { INDICES } else { 0 }),
+                Setting::Sensitivity(byte) => {
+                    let reason = match family {
+                        Some(family) => family.refuses_sensitivity(),
+                        None => Some("its type is not known"),
+                    };
+                    if let Some(reason) = reason {
+                        return Err(refused("sensitivity", reason));
+                    }
+                    plan.new.set(SENSITIVITY, byte);
+                }
+                Setting::PowerOn(power_on) => {
+                    let is_set = report.status().is_some_and(|status| status.has_permanent_baud());
+                    // The scanner does not report which rate it keeps, so keeping the present one is always a change.
+                    let needed = power_on == PowerOn::KeepBaud || is_set;
+                    plan.power_on = needed.then_some(power_on);
+                }
+                Setting::Configuration(given) if given.bytes().len() != plan.old.bytes().len() => {
+                    let (is, given) = (plan.old.bytes().len(), given.bytes().len());
+                    return Err(refused("configuration", &format!("it has {is} bytes, not {given}")));
+                }
+                Setting::Configuration(given) => plan.new = given,
+            }
+        }
+        Ok(())
+    }
+}
+
+fn parse_setting(text: &str) -> Result<Setting, Failure> {
+    let refuse =
+        |what: &str, remedy: String| Failure::new(Kind::Configuration, format!("{text}: {what}"), remedy);
+    let (key, value) = text
+        .split_once('=')
+        .ok_or_else(|| refuse("no = in it", "write KEY=VALUE, for example unit=mm".into()))?;
+    let Some((_, values, parse_value)) = KEYS.iter().find(|(known, ..)| *known == key) else {
+        let keys: Vec<&str> = KEYS.iter().map(|(key, ..)| *key).collect();
+        let nearest =
+            keys.iter().max_by(|a, b| strsim::jaro_winkler(a, key).total_cmp(&strsim::jaro_winkler(b, key)));
+        let near = nearest.filter(|known| strsim::jaro_winkler(known, key) > 0.75);
+        let near = near.map_or(String::new(), |known| format!("did you mean {known}? "));
+        return Err(refuse("unknown key", format!("{near}there are: {}", keys.join(", "))));
+    };
+    parse_value(value).ok_or_else(|| refuse("not possible", values.to_string()))
+}
+
+fn refused(key: &str, reason: &str) -> Failure {
+    let message = format!("{key} cannot be set on this sensor: {reason}");
+    Failure::new(Kind::Configuration, message, "nothing was written")
+}
+
+type Parse = fn(&str) -> Option<Setting>;
+
+/// The keys, their valid values as text, and their parsers.
+const KEYS: [(&str, &str, Parse); 7] = [
+    ("unit", "mm or cm", |value| match value {
+        "mm" => Some(Setting::Unit(Unit::Mm)),
+        "cm" => Some(Setting::Unit(Unit::Cm)),
+        _ => None,
+    }),
+    (
+        "mode",
+        "fields-abd (0x00), reflector3 (0x01), fields-abc (0x02), reflector2 (0x03), fields-ab (0x04), \
+         reflector1 (0x05), field-a (0x06), range (0x0F), energy (0x3F), or 0x0D and 0x0E",
+        |value| parse_mode(value).map(Mode).map(Setting::Mode),
+    ),
+    ("availability", "1, 2 or 3", |value| match value.parse() {
+        Ok(level @ 1..=3) => Some(Setting::Availability(level)),
+        _ => None,
+    }),
+    ("indices", "on or off", |value| match value {
+        "on" => Some(Setting::Indices(true)),
+        "off" => Some(Setting::Indices(false)),
+        _ => None,
+    }),
+    ("sensitivity", "standard, medium, low or high", |value| {
+        let at = SENSITIVITIES.iter().position(|name| *name == value)?;
+        Some(Setting::Sensitivity(at as u8))
+    }),
+    ("power_on_baud", "9600, or keep for the present rate", |value| match value {
+        "9600" => Some(Setting::PowerOn(PowerOn::Baud9600)),
+        "keep" => Some(Setting::PowerOn(PowerOn::KeepBaud)),
+        _ => None,
+    }),
+    ("configuration", "all 32 or 34 bytes in hex, as probe shows them", |value| {
+        let digits: Vec<u8> = value.chars().map(|c| Some(c.to_digit(16)? as u8)).collect::<Option<_>>()?;
+        let bytes: Vec<u8> =
+            digits.chunks(2).map(|pair| pair.iter().fold(0, |sum, d| sum << 4 | d)).collect();
+        digits
+            .len()
+            .is_multiple_of(2)
+            .then(|| OwnedConfiguration::new(&bytes))
+            .flatten()
+            .map(Setting::Configuration)
+    }),
+];
+
+/// Parses a measuring mode by name or number (Telegram listing, 77h block D).
+fn parse_mode(value: &str) -> Option<u8> {
+    const NAMES: [(&str, u8); 9] = [
+        ("fields-abd", 0x00),
+        ("reflector3", 0x01),
+        ("fields-abc", 0x02),
+        ("reflector2", 0x03),
+        ("fields-ab", 0x04),
+        ("reflector1", 0x05),
+        ("field-a", 0x06),
+        ("range", 0x0F),
+        ("energy", 0x3F),
+    ];
+    if let Some((_, byte)) = NAMES.iter().find(|(name, _)| *name == value) {
+        return Some(*byte);
+    }
+    let byte = match value.strip_prefix("0x") {
+        Some(hex) => u8::from_str_radix(hex, 16).ok()?,
+        None => value.parse().ok()?,
+    };
+    (NAMES.iter().any(|(_, known)| *known == byte) || matches!(byte, 0x0D | 0x0E)).then_some(byte)
+}
+
+/// Sensitivities of the LMS 291 by their number: 30, 25, 20 and 42 m at 10 % (Telegram listing, 77h block C).
+const SENSITIVITIES: [&str; 4] = ["standard", "medium", "low", "high"];
+
+/// Index of the sensitivity in the configuration. All indices are from the Telegram listing, 77h blocks C to E.
+const SENSITIVITY: usize = 3;
+/// See [`SENSITIVITY`].
+const AVAILABILITY: usize = 4;
+/// See [`SENSITIVITY`].
+const MODE: usize = 5;
+/// See [`SENSITIVITY`].
+pub(crate) const UNIT: usize = 6;
+const LEVEL_3: u8 = 1;
+const INDICES: u8 = 2;
+const LEVEL_2: u8 = 4;
+
+/// Asks a person for consent to `plan`, whose differences were shown.
+///
+/// # Errors
+///
+/// Returns [`Kind::Usage`] if stdin, or stderr with the question, is not a terminal, [`Kind::Interrupted`] if `stop` is
+/// set, and [`Kind::Failed`] if the answer is not `yes`.
+fn ask_person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
+    let input = stdin();
+    if !input.is_terminal() || !stderr().is_terminal() {
+        return Err(Failure::new(
+            Kind::Usage,
+            "nothing was written: a person must confirm it",
+            "run the same command in a terminal, with stdin and stderr not redirected",
+        ));
+    }
+    // Input that was typed before the question does not count as an answer.
+    let _ = tcflush(&input, QueueSelector::IFlush);
+    let question = "The EEPROM wears out after a few thousand writes. Write this? Type yes: ";
+    let _ = stderr().write_all(question.as_bytes());
+    loop {
+        if stop.load(Ordering::Relaxed) {
+            let _ = stderr().write_all(b"\n");
+            return Err(Failure::new(Kind::Interrupted, "interrupted, nothing was written", ""));
+        }
+        // A terminal becomes readable once it has a whole line.
+        let mut fds = [PollFd::new(&input, PollFlags::IN)];
+        if poll(&mut fds, Some(&STOP_CHECK_INTERVAL)).is_ok_and(|ready| ready > 0) {
+            break;
+        }
+    }
+    let mut answer = String::new();
+    let read = input.read_line(&mut answer);
+    // An answer without a newline, such as Ctrl-D, leaves the cursor on the line of the question.
+    if !answer.ends_with('\n') {
+        let _ = stderr().write_all(b"\n");
+    }
+    if read.is_ok() && answer.trim() == "yes" {
+        return Ok(Consent::of_a_person(plan));
+    }
+    Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "to write, answer: yes"))
+}
+
+/// Interval between checks for an interrupt.
+const STOP_CHECK_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+
+#[cfg(test)]
+mod tests {
+    use scanhub_drivers::lms::configuration::factory;
+    use scanhub_drivers::lms::variant::Baud;
+
+    use super::*;
+
+    fn plan() -> Plan {
+        let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();
+        Plan {
+            baud: Baud::B9600,
+            address: 0,
+            operating_mode: 0x25,
+            old,
+            new: old,
+            power_on: None,
+            password: Password::FACTORY,
+        }
+    }
+
+    fn applied(settings: &[&str], family: Option<Family>) -> Result<Plan, Failure> {
+        let settings: Vec<String> = settings.iter().map(|setting| (*setting).to_owned()).collect();
+        let mut plan = plan();
+        SettingsRequest::parse(&settings)?.apply(&mut plan, family, &Report::default())?;
+        Ok(plan)
+    }
+
+    #[test]
+    fn each_key_changes_its_byte() {
+        let byte = |setting: &str, at: usize| {
+            let plan = applied(&[setting], Some(Family::Lms291)).unwrap();
+            plan.new.bytes()[at]
+        };
+        assert_eq!((byte("unit=cm", 6), byte("unit=mm", 6)), (0, 1));
+        assert_eq!((byte("mode=reflector1", 5), byte("mode=0x0F", 5), byte("mode=13", 5)), (5, 15, 13));
+        assert_eq!((byte("availability=3", 4), byte("availability=2", 4)), (1, 4));
+        assert_eq!((byte("indices=on", 4), byte("sensitivity=high", 3)), (2, 3));
+        let both = applied(&["indices=on", "availability=3", "indices=off"], None).unwrap();
+        assert_eq!(both.new.bytes()[4], 1);
+        assert!(applied(&["unit=mm", "mode=1", "power_on_baud=9600"], None).unwrap().is_empty());
+        assert_eq!(applied(&["power_on_baud=keep"], None).unwrap().power_on, Some(PowerOn::KeepBaud));
+        let hex = "00".repeat(34);
+        assert_eq!(applied(&[&format!("configuration={hex}")], None).unwrap().new.bytes(), [0; 34]);
+    }
+
+    #[test]
+    fn rejects_invalid_settings_with_valid_ones() {
+        let refusal = |setting: &str, family| {
+            let failure = applied(&[setting], family).unwrap_err();
+            assert_eq!(failure.kind, Kind::Configuration);
+            failure.to_string()
+        };
+        for (setting, words) in [
+            ("unit", "KEY=VALUE"),
+            ("units=mm", "did you mean unit?"),
+            ("unit=dm", "mm or cm"),
+            ("mode=7", "reflector3 (0x01)"),
+            ("mode=0x100", "reflector3"),
+            ("availability=4", "1, 2 or 3"),
+            ("power_on_baud=500000", "9600, or keep"),
+            ("configuration=00", "32 or 34 bytes"),
+            ("sensitivity=high", "only the LMS 291"),
+        ] {
+            let text = refusal(setting, Some(Family::Lms200));
+            assert!(text.contains(words), "{setting}: {text}");
+        }
+        assert!(refusal("sensitivity=low", None).contains("not known"));
+        let old = format!("configuration={}", "00".repeat(32));
+        assert!(refusal(&old, None).contains("34 bytes, not 32"));
+        assert_eq!(SettingsRequest::parse(&[]).unwrap_err().kind, Kind::Usage);
+    }
+}

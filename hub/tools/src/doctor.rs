@@ -5,13 +5,11 @@
 //! the last request, and its driver returns bytes at once.
 
 mod hub;
+mod installation;
 mod line;
 mod machine;
 mod sensor;
 mod shared_memory;
-mod system;
-mod systemd;
-mod version;
 
 use std::fmt;
 use std::sync::atomic::AtomicBool;
@@ -19,17 +17,17 @@ use std::sync::atomic::AtomicBool;
 pub use crate::bridge_program::Bridge;
 use config::{Config, Gateway, Link};
 pub(crate) use hub::Hub;
+pub use installation::System;
 use machine::Facts;
 use port::{Candidate, PortlessAdapter, Source, candidates};
 use schema::limits::TopicLimits;
 use schema::{Failure, Kind, Printable};
 use serde::Serialize;
 use shm::Domain;
-pub use system::System;
 
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
-pub struct Subjects {
+pub struct CheckTargets {
     /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration and of
     /// the running hub.
     pub ports: Vec<Source>,
@@ -190,8 +188,8 @@ impl fmt::Display for Finding {
 /// # Errors
 ///
 /// Returns [`Kind::Check`] with the number of checks that failed, and [`Kind::Interrupted`] if `stop` is set.
-pub fn examine(
-    subjects: &Subjects,
+pub fn run_checks(
+    targets: &CheckTargets,
     stop: &AtomicBool,
     tell: &mut dyn FnMut(&Finding),
 ) -> Result<(), Failure> {
@@ -201,29 +199,29 @@ pub fn examine(
         tell(&finding);
     };
     let there = candidates();
-    let home = subjects.places.iter().find(|place| matches!(shm::holder(place.root()), Ok(Some(_))));
-    let domain = home.unwrap_or(&subjects.domain);
+    let home = targets.places.iter().find(|place| matches!(shm::holder(place.root()), Ok(Some(_))));
+    let domain = home.unwrap_or(&targets.domain);
     let hub = Hub::find(domain);
-    let portless = PortlessAdapter::all(&subjects.system.path("/"));
-    let ports = choose(subjects, &there, &portless, hub.as_ref(), &mut tell);
+    let portless = PortlessAdapter::all(&targets.system.path("/"));
+    let ports = choose(targets, &there, &portless, hub.as_ref(), &mut tell);
     for adapter in &portless {
         tell(line::without_port(adapter, ports.is_empty()));
     }
-    let (system, pid) = (&subjects.system, hub.as_ref().map(|hub| hub.pid));
-    if subjects.clean {
-        let elsewhere = subjects.places.iter().filter(|place| place.root() != domain.root());
+    let (system, pid) = (&targets.system, hub.as_ref().map(|hub| hub.pid));
+    if targets.clean {
+        let elsewhere = targets.places.iter().filter(|place| place.root() != domain.root());
         let places: Vec<&Domain> = std::iter::once(domain).chain(elsewhere).collect();
         tell(shared_memory::clean(&places, system.user()));
     }
-    tell(version::version(system, pid));
-    tell(systemd::service(system, pid));
-    tell(systemd::rules(system, &there));
-    let limits = match &subjects.config {
+    tell(installation::version(system, pid));
+    tell(installation::service(system, pid));
+    tell(installation::rules(system, &there));
+    let limits = match &targets.config {
         Some(Ok(config)) => config.topic_limits(),
         _ => vec![TopicLimits::default(); ports.len().max(1)],
     };
-    let facts = Facts::gather(domain, &subjects.places, limits, hub.as_ref());
-    let config = subjects.config.as_ref().and_then(|config| config.as_ref().ok());
+    let facts = Facts::gather(domain, &targets.places, limits, hub.as_ref());
+    let config = targets.config.as_ref().and_then(|config| config.as_ref().ok());
     tell(machine::memory(&facts, config.and_then(config::Config::memory_remedy)));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
@@ -231,9 +229,9 @@ pub fn examine(
     tell(shared_memory::leftovers(&facts));
     tell(machine::descriptors(&facts));
     tell(machine::file_size(&facts));
-    tell(systemd::logout(system, pid.and_then(version::user_of).unwrap_or(system.user())));
-    tell(machine::multicast(system, subjects.gateway.interface.as_deref()));
-    subjects.bridge.check().into_iter().for_each(&mut tell);
+    tell(installation::logout(system, pid.and_then(installation::user_of).unwrap_or(system.user())));
+    tell(machine::multicast(system, targets.gateway.interface.as_deref()));
+    targets.bridge.check().into_iter().for_each(&mut tell);
     for subject in &ports {
         let link = subject.link.as_ref().map(|link| link.name.as_str());
         let of_hub = || hub.as_ref().and_then(|hub| hub.link(&subject.source)).map(|(name, _)| name);
@@ -254,14 +252,14 @@ pub fn examine(
 /// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine, with
 /// the ports of the running hub.
 fn choose(
-    subjects: &Subjects,
+    targets: &CheckTargets,
     there: &[Candidate],
     portless: &[PortlessAdapter],
     hub: Option<&Hub>,
     tell: &mut impl FnMut(Finding),
 ) -> Vec<Subject> {
     const NAME: &str = "configuration";
-    let links = match &subjects.config {
+    let links = match &targets.config {
         Some(Ok(config)) => {
             let names: Vec<&str> = config.links.iter().map(|link| link.name.as_str()).collect();
             tell(Finding::ok(NAME, format!("links {}", names.join(", "))));
@@ -274,8 +272,8 @@ fn choose(
         None => &[],
     };
     let of_link = |source: &Source| links.iter().find(|link| link.port.is_same_port(source)).cloned();
-    if !subjects.ports.is_empty() {
-        let named = subjects.ports.iter();
+    if !targets.ports.is_empty() {
+        let named = targets.ports.iter();
         return named
             .map(|source| hub.and_then(|hub| hub.port_of(source)).unwrap_or_else(|| source.clone()))
             .map(|source| Subject { link: of_link(&source), source, named: true })

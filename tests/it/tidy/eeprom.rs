@@ -56,15 +56,15 @@ fn nobody_writes_the_eeprom() {
 fn consent_is_given_by_persons() {
     holds(sources::consent_is_given_by_persons, |tree| {
         let planted = "//! Writes.\nlet consent = Consent::of_a_person(plan);\n";
-        let ask = tree.text("hub/tools/src/configure/ask.rs");
+        let ask = tree.text("hub/tools/src/configure.rs");
         let plan = tree.text("hub/lms-configure/src/plan.rs");
         vec![
             tree.with("hub/daemon/src/link.rs", planted),
-            tree.with("hub/tools/src/configure.rs", planted),
+            tree.with("hub/tools/src/probe.rs", planted),
             tree.with("hub/cli/configure.rs", planted),
             tree.with(
-                "hub/tools/src/configure/ask.rs",
-                &ask.replace("fn person", &format!("{planted}fn person")),
+                "hub/tools/src/configure.rs",
+                &ask.replace("fn ask_person", &format!("{planted}fn ask_person")),
             ),
             tree.with(
                 "hub/lms-configure/src/plan.rs",

@@ -16,8 +16,8 @@ use shm::shortage::SHARED_MEMORY;
 use shm::{Domain, Environment, RunningHub};
 
 use super::hub::Hub;
+use super::installation::is_stopped;
 use super::shared_memory::{self, SharedFile};
-use super::version::is_stopped;
 use super::{Finding, System};
 
 /// Facts about the machine and the domain.
@@ -377,7 +377,7 @@ pub(super) mod tests {
 
     use super::*;
     use crate::doctor::State;
-    use crate::doctor::system::tests::TempRoot;
+    use crate::doctor::installation::TempRoot;
 
     const ROOMY: Memory = Memory { size: 64 << 20, free: 60 << 20, free_files: None, is_read_only: false };
 

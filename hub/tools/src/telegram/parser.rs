@@ -1,6 +1,5 @@
-//! Everything in a stream of bytes, in both directions: the sensor's telegrams as the framer finds them, and what is
-//! between them: requests, acknowledgements, damaged and incomplete telegrams, and other bytes. Every byte is in exactly
-//! one item.
+//! Splits a stream of bytes, in both directions, into items: the telegrams of the scanner that the framer finds, and between
+//! them requests, acknowledgements, damaged and incomplete telegrams, and other bytes. Every byte is in exactly one item.
 
 use std::io;
 
@@ -11,47 +10,47 @@ use scanhub_drivers::lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, 
 
 /// A part of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Item<'a> {
-    /// A telegram with a right checksum.
+pub(crate) enum Item<'a> {
+    /// A telegram with a valid checksum.
     Telegram(Telegram<'a>),
-    /// As long as it says, but with a wrong checksum.
+    /// A telegram of the announced length with a wrong checksum.
     Broken {
-        /// All of it.
+        /// The whole telegram.
         bytes: &'a [u8],
         /// The checksum of its bytes.
         expected: u16,
     },
-    /// The head of a telegram that goes on as something else.
+    /// The start of a telegram that continues as something else.
     Cut {
-        /// What there is of it.
+        /// The bytes of the telegram.
         bytes: &'a [u8],
-        /// How long it would have been.
+        /// The announced length.
         announced: usize,
     },
     /// A single byte before a reply.
     Ack,
     /// A single byte instead of one.
     Nak,
-    /// In nothing.
+    /// Bytes that belong to no telegram.
     Other(&'a [u8]),
 }
 
-/// Who is told what was found, and at which byte of the stream.
-pub(super) type Sink<'s> = dyn FnMut(u64, Item<'_>) -> io::Result<()> + 's;
+/// Receives each item with its position in the stream.
+pub(crate) type Sink<'s> = dyn FnMut(u64, Item<'_>) -> io::Result<()> + 's;
 
-/// Finds items in bytes that come piece by piece.
+/// Splits bytes that arrive in pieces into items.
 #[derive(Default)]
-pub(super) struct Finder {
+pub(crate) struct StreamParser {
     framer: Framer,
-    /// Bytes that were not told yet.
+    /// Bytes whose items were not reported yet.
     pending: Vec<u8>,
-    /// Number of the first of them in the stream.
+    /// Position of the first of them in the stream.
     base: u64,
 }
 
-impl Finder {
-    /// More bytes.
-    pub(super) fn feed(&mut self, mut bytes: &[u8], sink: &mut Sink<'_>) -> io::Result<()> {
+impl StreamParser {
+    /// Adds bytes.
+    pub(crate) fn feed(&mut self, mut bytes: &[u8], sink: &mut Sink<'_>) -> io::Result<()> {
         while !bytes.is_empty() {
             let spare = self.framer.spare();
             let (now, later) = bytes.split_at(bytes.len().min(spare.len()));
@@ -60,15 +59,15 @@ impl Finder {
             self.pending.extend(now);
             bytes = later;
             self.drain(sink)?;
-            if self.pending.len() > MOST_PENDING {
-                self.relieve(sink)?;
+            if self.pending.len() > MAX_PENDING {
+                self.report_old(sink)?;
             }
         }
         Ok(())
     }
 
-    /// There is no more.
-    pub(super) fn end(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
+    /// Ends the stream.
+    pub(crate) fn end(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
         self.framer.release(VETO_HOLD);
         self.drain(sink)?;
         between(&self.pending, self.base, false, sink)
@@ -87,11 +86,11 @@ impl Finder {
         Ok(())
     }
 
-    /// Tells what the framer has given up long ago, up to a place where no telegram is cut in two.
-    fn relieve(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
-        let most = self.pending.len() - 2 * MAX_TELEGRAM;
-        let across = whole(&self.pending).find(|&(at, telegram)| at + telegram.bytes().len() > most);
-        let end = across.map_or(most, |(at, _)| at.min(most));
+    /// Reports bytes that the framer has dropped long ago, up to a position at which no telegram is split.
+    fn report_old(&mut self, sink: &mut Sink<'_>) -> io::Result<()> {
+        let max = self.pending.len() - 2 * MAX_TELEGRAM;
+        let across = whole(&self.pending).find(|&(at, telegram)| at + telegram.bytes().len() > max);
+        let end = across.map_or(max, |(at, _)| at.min(max));
         between(&self.pending[..end], self.base, false, sink)?;
         self.pending.drain(..end);
         self.base += end as u64;
@@ -99,20 +98,20 @@ impl Finder {
     }
 }
 
-/// Tells what lies before a telegram of the sensor's, or at the end.
+/// Reports the items before a telegram of the scanner, or at the end.
 fn between(bytes: &[u8], base: u64, before_reply: bool, sink: &mut Sink<'_>) -> io::Result<()> {
-    let mut told = 0;
+    let mut reported = 0;
     let mut after_telegram = false;
     for (at, telegram) in whole(bytes) {
-        scraps(&bytes[told..at], base + told as u64, (after_telegram, false), sink)?;
+        scraps(&bytes[reported..at], base + reported as u64, (after_telegram, false), sink)?;
         sink(base + at as u64, Item::Telegram(telegram))?;
-        told = at + telegram.bytes().len();
+        reported = at + telegram.bytes().len();
         after_telegram = true;
     }
-    scraps(&bytes[told..], base + told as u64, (after_telegram, before_reply), sink)
+    scraps(&bytes[reported..], base + reported as u64, (after_telegram, before_reply), sink)
 }
 
-/// The telegrams with a right checksum in `bytes`, in either direction, that do not overlap, with their places.
+/// Returns the telegrams with a valid checksum in `bytes`, in either direction, with their positions. They do not overlap.
 fn whole(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
     let mut from = 0;
     std::iter::from_fn(move || {
@@ -128,10 +127,10 @@ fn whole(bytes: &[u8]) -> impl Iterator<Item = (usize, Telegram<'_>)> {
     })
 }
 
-/// Tells bytes among which there is no whole telegram. An acknowledgement is one right behind a request or right before
-/// a reply, as `neighbours` are there, or alone.
-fn scraps(bytes: &[u8], base: u64, neighbours: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
-    let (after_request, before_reply) = neighbours;
+/// Reports bytes without a whole telegram. A byte counts as an acknowledgement directly after a request, directly before a
+/// reply, or alone. `neighbors` are whether a request is before the bytes, and a reply after them.
+fn scraps(bytes: &[u8], base: u64, neighbors: (bool, bool), sink: &mut Sink<'_>) -> io::Result<()> {
+    let (after_request, before_reply) = neighbors;
     let mut other = 0;
     let mut at = 0;
     while at < bytes.len() {
@@ -166,22 +165,22 @@ fn scraps(bytes: &[u8], base: u64, neighbours: (bool, bool), sink: &mut Sink<'_>
     if other < at { sink(base + other as u64, Item::Other(&bytes[other..at])) } else { Ok(()) }
 }
 
-/// Whole length of the telegram whose head `bytes` begin with.
+/// Returns the length of the telegram whose head `bytes` start with.
 fn announced(bytes: &[u8]) -> Option<usize> {
     let &[STX, _, low, high, ..] = bytes else { return None };
     let length = usize::from(u16::from_le_bytes([low, high]));
     (1..=MAX_LENGTH).contains(&length).then_some(length + FRAME)
 }
 
-/// The same, if a head with that address has that command.
+/// Returns the same length, if the command exists in the direction of the address.
 fn plausible(bytes: &[u8]) -> Option<usize> {
     let len = announced(bytes)?;
     let is_reply = bytes[1] & REPLY != 0;
     name(*bytes.get(4)?, is_reply).is_some().then_some(len)
 }
 
-/// Bytes that may belong to nothing before some of them are told.
-const MOST_PENDING: usize = 64 * 1024;
+/// Maximum number of bytes whose items were not reported.
+const MAX_PENDING: usize = 64 * 1024;
 
 #[cfg(test)]
 mod tests {
@@ -203,22 +202,22 @@ mod tests {
                 Item::Nak => (1, "nak".to_owned()),
                 Item::Other(bytes) => (bytes.len(), format!("{} other", bytes.len())),
             };
-            assert_eq!(offset, next, "a byte is told twice, or not");
+            assert_eq!(offset, next, "a byte is reported twice, or never");
             next += len as u64;
             items.push((offset, words));
             Ok(())
         };
-        let mut finder = Finder::default();
+        let mut parser = StreamParser::default();
         for piece in bytes.chunks(piece) {
-            finder.feed(piece, &mut sink).unwrap();
+            parser.feed(piece, &mut sink).unwrap();
         }
-        finder.end(&mut sink).unwrap();
+        parser.end(&mut sink).unwrap();
         assert_eq!(next, bytes.len() as u64);
         items
     }
 
     #[test]
-    fn a_conversation_on_both_lines() {
+    fn splits_requests_and_replies() {
         let scan = lms::measured::encode(0, Unit::Mm, &[100; 361], 0x10);
         let mut bytes = vec![0xFF, 0x06, 0x33];
         bytes.extend(Request::Status.encode(0).bytes());
@@ -252,10 +251,10 @@ mod tests {
     }
 
     #[test]
-    fn noise_without_end_is_told_in_time() {
-        let mut bytes = vec![0x55; 3 * MOST_PENDING];
+    fn reports_endless_noise_in_time() {
+        let mut bytes = vec![0x55; 3 * MAX_PENDING];
         let request = Request::Type.encode(0);
-        bytes[2 * MOST_PENDING..][..request.bytes().len()].copy_from_slice(request.bytes());
+        bytes[2 * MAX_PENDING..][..request.bytes().len()].copy_from_slice(request.bytes());
         let items = found(&bytes, 1000);
         assert_eq!(items.iter().filter(|(_, item)| item == "3A").count(), 1);
         assert_eq!(found(&[ACK], 1), [(0, "ack".to_owned())]);

@@ -1,16 +1,233 @@
-//! Checks the files that systemd, udev and logind read: the service with its program and the udev rule, which
-//! `hub/dist/install.sh` installs, and what logind does to shared memory at logout. Reads only files. A hub that is
-//! started by hand needs neither service nor rule.
+//! Checks of the installation: the version of the running hub, and the files that systemd, udev and logind read. These are
+//! the service with its program and the udev rule, which `hub/dist/install.sh` installs, and the configuration of logind,
+//! which may remove shared memory at logout. A hub that is started by hand needs neither service nor rule.
+//!
+//! Hub and clients of different versions refuse each other. Programs are compared by their bytes, or else by the version
+//! that they report.
 
-use std::fs;
-use std::io::ErrorKind;
+use std::fs::{self, File, Metadata};
+use std::io::{ErrorKind, Read};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::Duration;
 
 use port::Candidate;
+use rustix::process::{geteuid, getuid};
 use scanhub_files::regular;
+use shm::LIBRARY;
 
-use super::version::{Build, VERSION, compare};
-use super::{Finding, System};
+use crate::doctor::Finding;
+
+/// The files of a machine, and the user that reads them. They are below a directory that need not be the root of this
+/// machine, so that tests can provide files of an administrator.
+#[derive(Clone, Debug)]
+pub struct System {
+    root: PathBuf,
+    user: u32,
+}
+
+impl System {
+    /// Returns this machine, and the user of this process.
+    pub fn this() -> System {
+        System::at("/", getuid().as_raw())
+    }
+
+    /// Creates a machine whose files are below `root`, for the user with this ID.
+    pub fn at(root: impl Into<PathBuf>, user: u32) -> System {
+        System { root: root.into(), user }
+    }
+
+    /// Returns the user's ID.
+    pub(crate) fn user(&self) -> u32 {
+        self.user
+    }
+
+    /// Returns the path at which this process finds `path` of that machine.
+    pub(crate) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
+        let path = path.as_ref();
+        self.root.join(path.strip_prefix("/").unwrap_or(path))
+    }
+
+    /// Returns the text of a file, or `None` if it cannot be read.
+    pub(crate) fn text(&self, path: &str) -> Option<String> {
+        regular::read_text(&self.path(path), regular::LONGEST).ok()
+    }
+
+    /// Returns the path of `name` in the first of `directories` that has it. A symlink without a target counts.
+    pub(crate) fn first(&self, directories: &[&str], name: &str) -> Option<PathBuf> {
+        let paths = directories.iter().map(|directory| self.path(directory).join(name));
+        paths.into_iter().find(|path| path.symlink_metadata().is_ok())
+    }
+
+    /// Returns the files of `directories` whose names end with `.conf`, in the order of their names. If several files
+    /// have the same name, only that of the first directory counts (as systemd reads drop-in files).
+    fn drop_ins(&self, directories: &[String]) -> Vec<PathBuf> {
+        let mut found: Vec<PathBuf> = Vec::new();
+        for directory in directories {
+            for entry in fs::read_dir(self.path(directory)).into_iter().flatten().flatten() {
+                let path = entry.path();
+                let is_known = found.iter().any(|known| known.file_name() == path.file_name());
+                if !is_known && path.extension().is_some_and(|extension| extension == "conf") {
+                    found.push(path);
+                }
+            }
+        }
+        found.sort_by(|a, b| a.file_name().cmp(&b.file_name()));
+        found
+    }
+
+    /// Returns the name of the user with this ID, or the ID if the user has no name.
+    pub(crate) fn name_of(&self, user: u32) -> String {
+        let known = self.text("etc/passwd").unwrap_or_default();
+        let number = user.to_string();
+        let line = known.lines().find(|line| line.split(':').nth(2) == Some(&number));
+        line.and_then(|line| line.split(':').next()).map_or(number, str::to_owned)
+    }
+}
+
+/// The version of this program.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// A program, compared with this one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum VersionMatch {
+    /// A program with the same bytes.
+    Same,
+    /// Another build, and the version that it reports; `None` if it must not be started, or reports none.
+    Other(Option<String>),
+}
+
+/// The program of a hub's process.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Running {
+    build: VersionMatch,
+    /// Whether its file was replaced or removed after the start.
+    is_replaced: bool,
+}
+
+/// Reports the versions, and compares this program with that of the `hub`, if one runs.
+pub(crate) fn version(system: &System, hub: Option<u32>) -> Finding {
+    let kernel = system.text("proc/sys/kernel/osrelease").unwrap_or_default();
+    let own = match kernel.trim() {
+        "" => format!("scanhub {VERSION}, {LIBRARY}"),
+        kernel => format!("scanhub {VERSION}, {LIBRARY}, Linux {kernel}"),
+    };
+    judge(own, hub.map(|pid| (pid, running(pid))))
+}
+
+fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
+    const NAME: &str = "version";
+    let restart = "restart the hub: sudo systemctl restart scanhub, if it is the service";
+    match hub {
+        None => Finding::ok(NAME, own),
+        Some((_, None)) => {
+            Finding::ok(NAME, format!("{own}; this user may not see which program the hub runs"))
+        }
+        Some((pid, Some(Running { build: VersionMatch::Other(Some(version)), .. })))
+            if version != VERSION =>
+        {
+            let text = format!("{own}; the hub, process {pid}, is scanhub {version}: they refuse each other");
+            Finding::failed(NAME, text, format!("use one version for both; {restart}"))
+        }
+        Some((pid, Some(Running { is_replaced: true, build }))) if build != VersionMatch::Same => {
+            let text = format!("{own}; the hub, process {pid}, runs a program that was replaced since");
+            Finding::warning(NAME, text, restart)
+        }
+        Some((_, Some(Running { is_replaced: true, .. }))) => {
+            Finding::ok(NAME, format!("{own}; the hub runs this version; its file was replaced"))
+        }
+        Some((_, Some(Running { build: VersionMatch::Same, .. }))) => {
+            Finding::ok(NAME, format!("{own}; the hub runs the same program"))
+        }
+        Some((_, Some(Running { .. }))) => Finding::ok(NAME, format!("{own}; the hub runs another build")),
+    }
+}
+
+/// Returns the program of process `pid`, or `None` if this user may not see it.
+fn running(pid: u32) -> Option<Running> {
+    let process = PathBuf::from(format!("/proc/{pid}"));
+    let link = fs::read_link(process.join("exe")).ok()?;
+    let is_own = user_of(pid) == Some(geteuid().as_raw());
+    let build = compare(&process.join("exe"), is_own).ok()?;
+    Some(Running { build, is_replaced: link.to_string_lossy().ends_with(" (deleted)") })
+}
+
+/// Compares `program` with this one. Starts it to query its version only if it is `trusted`, and if only this user and
+/// root can write it.
+///
+/// # Errors
+///
+/// Returns the system's error if the file cannot be read.
+fn compare(program: &Path, trusted: bool) -> std::io::Result<VersionMatch> {
+    let (ours, theirs) = (File::open("/proc/self/exe")?, File::open(program)?);
+    let (our, their) = (ours.metadata()?, theirs.metadata()?);
+    if !their.is_file() {
+        return Err(std::io::ErrorKind::InvalidInput.into());
+    }
+    if (our.dev(), our.ino()) == (their.dev(), their.ino())
+        || (our.len() == their.len() && is_same(ours, theirs))
+    {
+        return Ok(VersionMatch::Same);
+    }
+    Ok(VersionMatch::Other(if trusted && is_ours(&their) { reported_version(program) } else { None }))
+}
+
+/// Returns the user that process `pid` runs as. The owner of its directory may be root instead.
+pub(crate) fn user_of(pid: u32) -> Option<u32> {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    status.lines().find_map(|line| line.strip_prefix("Uid:"))?.split_whitespace().next()?.parse().ok()
+}
+
+/// Returns whether a signal or a debugger has stopped process `pid`.
+pub(crate) fn is_stopped(pid: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let state = status.lines().find_map(|line| line.strip_prefix("State:"));
+    state.is_some_and(|state| state.trim_start().starts_with(['T', 't']))
+}
+
+/// Returns whether only this user and root can write a file.
+fn is_ours(metadata: &Metadata) -> bool {
+    [0, geteuid().as_raw()].contains(&metadata.uid()) && metadata.mode() & 0o022 == 0
+}
+
+fn is_same(mut one: File, mut other: File) -> bool {
+    let (mut left, mut right) = (vec![0; PIECE], vec![0; PIECE]);
+    loop {
+        match one.read(&mut left) {
+            Ok(0) => return true,
+            Ok(len) if other.read_exact(&mut right[..len]).is_ok() && left[..len] == right[..len] => {}
+            _ => return false,
+        }
+    }
+}
+
+/// Returns the version that `program --version` prints within two seconds, if it is a scanhub.
+fn reported_version(program: &Path) -> Option<String> {
+    let mut command = Command::new(program);
+    command.arg("--version").stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut process = command.spawn().ok()?;
+    for _ in 0..POLLS {
+        if let Ok(Some(_)) = process.try_wait() {
+            let mut output = String::new();
+            process.stdout.take()?.take(MAX_OUTPUT).read_to_string(&mut output).ok()?;
+            return Some(output.lines().next()?.strip_prefix("scanhub ")?.trim().to_owned());
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+    let _ = process.kill();
+    let _ = process.wait();
+    None
+}
+
+/// Number of bytes that are compared at once.
+const PIECE: usize = 1 << 16;
+/// Maximum length of the output of `--version`, in bytes.
+const MAX_OUTPUT: u64 = 1 << 10;
+/// Number of polls: two seconds in total.
+const POLLS: u32 = 200;
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
 
 /// Checks whether the service is installed, starts this version, and runs if it is enabled. `hub` is the process of the
 /// hub, if one runs.
@@ -28,16 +245,16 @@ pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
     };
     let place = system.path(&program);
     let build = match compare(&place, true) {
-        Ok(Build::Same) => "this program".to_owned(),
-        Ok(Build::Other(Some(version))) if version == VERSION => format!("another build of {VERSION}"),
-        Ok(Build::Other(Some(version))) => {
+        Ok(VersionMatch::Same) => "this program".to_owned(),
+        Ok(VersionMatch::Other(Some(version))) if version == VERSION => format!("another build of {VERSION}"),
+        Ok(VersionMatch::Other(Some(version))) => {
             return Finding::warning(
                 NAME,
                 format!("{at} starts {}, version {version}; this is {VERSION}", program.display()),
                 format!("{INSTALL}, then sudo systemctl restart scanhub"),
             );
         }
-        Ok(Build::Other(None)) => "a program that does not report its version".to_owned(),
+        Ok(VersionMatch::Other(None)) => "a program that does not report its version".to_owned(),
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let text = format!("{at} starts {}, which is not there", program.display());
             return Finding::failed(NAME, text, INSTALL);
@@ -230,12 +447,15 @@ const CONFIGURATIONS: [&str; 4] = ["etc/systemd", "run/systemd", "usr/local/lib/
 const LAST_SYSTEM_USER: u32 = 999;
 
 #[cfg(test)]
+pub(crate) use tests::TempRoot;
+
+#[cfg(test)]
 mod tests {
     use port::found_in;
 
-    use super::*;
     use crate::doctor::State;
-    use crate::doctor::system::tests::TempRoot;
+
+    use super::*;
 
     const SERVICE: &str = include_str!("../../../dist/scanhub.service");
 
@@ -318,5 +538,94 @@ mod tests {
             temp.put(path, content);
             assert_eq!(state(1000), expected, "{path}");
         }
+    }
+
+    #[test]
+    fn judges_program_of_hub() {
+        let of =
+            |build, is_replaced| judge("own".to_owned(), Some((7, Some(Running { build, is_replaced }))));
+        let other = |version: &str| VersionMatch::Other(Some(version.to_owned()));
+        assert_eq!(judge("own".to_owned(), None).state, State::Ok);
+        assert_eq!(judge("own".to_owned(), Some((7, None))).state, State::Ok);
+        assert_eq!(of(VersionMatch::Same, false).state, State::Ok);
+        assert_eq!(of(other(VERSION), false).state, State::Ok);
+        assert_eq!(of(VersionMatch::Same, true).state, State::Ok);
+        let replaced = of(other(VERSION), true);
+        assert!(replaced.state == State::Warning && replaced.remedy.contains("restart"), "{replaced}");
+        let different = of(other("0.0.1"), false);
+        assert!(
+            different.state == State::Failed && different.finding.contains("scanhub 0.0.1"),
+            "{different}"
+        );
+    }
+
+    #[test]
+    fn recognizes_own_program() {
+        let own = running(std::process::id()).expect("may be seen");
+        assert_eq!(own, Running { build: VersionMatch::Same, is_replaced: false });
+        assert_eq!(running(0), None);
+    }
+
+    #[test]
+    fn compares_programs_by_their_bytes() {
+        let temp = TempRoot::new(7, &[("else", "#!/bin/sh\necho scanhub 9.9.9\n")]);
+        let own = std::env::current_exe().unwrap();
+        assert_eq!(compare(&own, false).unwrap(), VersionMatch::Same);
+        std::fs::copy(&own, temp.path("copy")).unwrap();
+        assert_eq!(compare(&temp.path("copy"), true).unwrap(), VersionMatch::Same);
+        // The file is not executable, so it reports no version.
+        assert_eq!(compare(&temp.path("else"), true).unwrap(), VersionMatch::Other(None));
+        assert!(compare(&temp.path("nothing"), true).is_err() && compare(&temp.path(""), true).is_err());
+    }
+
+    /// Files below a temporary directory.
+    pub(crate) struct TempRoot {
+        root: PathBuf,
+        _directory: tempfile::TempDir,
+        pub(crate) system: System,
+    }
+
+    impl TempRoot {
+        /// Creates `files` from paths and contents, for `user`.
+        pub(crate) fn new(user: u32, files: &[(&str, &str)]) -> TempRoot {
+            let directory = tempfile::tempdir().unwrap();
+            let root = directory.path().canonicalize().unwrap();
+            let temp = TempRoot { system: System::at(&root, user), root, _directory: directory };
+            for (path, content) in files {
+                temp.put(path, content);
+            }
+            temp
+        }
+
+        pub(crate) fn put(&self, path: &str, content: &str) {
+            let path = self.path(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, content).unwrap();
+        }
+
+        pub(crate) fn link(&self, target: &str, path: &str) {
+            let path = self.path(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::os::unix::fs::symlink(target, path).unwrap();
+        }
+
+        pub(crate) fn path(&self, path: &str) -> PathBuf {
+            self.root.join(path)
+        }
+    }
+
+    #[test]
+    fn uses_first_of_files_with_same_name() {
+        let files =
+            [("etc/x.d/b.conf", "1"), ("usr/x.d/b.conf", "2"), ("usr/x.d/a.conf", "3"), ("etc/x.d/c", "4")];
+        let temp = TempRoot::new(7, &files);
+        let found = temp.system.drop_ins(&["etc/x.d".to_owned(), "usr/x.d".to_owned()]);
+        assert_eq!(found, [temp.path("usr/x.d/a.conf"), temp.path("etc/x.d/b.conf")]);
+    }
+
+    #[test]
+    fn returns_name_of_user() {
+        let temp = TempRoot::new(7, &[("etc/passwd", "root:x:0:0::/:\nrobot:x:7:7::/:\n")]);
+        assert_eq!([7, 8].map(|user| temp.system.name_of(user)), ["robot", "8"]);
     }
 }
