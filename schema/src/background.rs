@@ -12,7 +12,7 @@ use crate::limits::TopicLimits;
 use crate::sliced::sliced;
 use crate::topic::PayloadLen;
 
-/// Head of a [`Background`], before the ranges. 32 bytes.
+/// Head of a background model, before the ranges. 32 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct BackgroundHead {
@@ -29,7 +29,7 @@ pub struct BackgroundHead {
     pub taught: u16,
     /// Number of beams of the model; 0 before the first scan.
     pub count: u16,
-    /// [`Background::FROZEN`] or 0.
+    /// Flags: [`Background::FROZEN`].
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 3],
@@ -116,7 +116,7 @@ impl fmt::Debug for Background {
 /// Maximum number of segments of a scan.
 pub const SEGMENTS: usize = 64;
 
-/// Head of a [`Foreground`], before the arrays. 24 bytes.
+/// Head of a foreground, before the arrays. 24 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ForegroundHead {

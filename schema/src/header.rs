@@ -7,41 +7,41 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::Family;
 
-/// The user header of every topic, 64 bytes, the same for all.
+/// Header of every sample, the same for all topics: the user header of the services in shared memory. 64 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v2"))]
 #[repr(C)]
 pub struct Header {
-    /// Number of the telegram that the sample was made from: per sensor and run of the hub, from 0. In a status, the
-    /// number of the last telegram.
+    /// Number of the telegram that the sample was computed from, per sensor and run of the hub, from 0. A sample
+    /// without a telegram has the number of the last telegram; before the first telegram 0, like the first one.
     pub seq: u64,
-    /// Number of the sample in its topic, from 0, gap-free as sent: a gap is what a consumer missed.
+    /// Number of the sample in its topic, from 0. A gap means that the subscriber missed samples.
     pub topic_seq: u64,
-    /// CLOCK_MONOTONIC of the telegram's first byte, in ns.
+    /// Stamp of the telegram's first byte, in ns of CLOCK_MONOTONIC.
     pub stamp_first_ns: u64,
-    /// CLOCK_MONOTONIC of the telegram's last byte, in ns.
+    /// Stamp of the telegram's last byte, in ns of CLOCK_MONOTONIC.
     pub stamp_last_ns: u64,
-    /// The wall clock of the telegram's first byte, ns since 1970.
+    /// Wall clock of the telegram's first byte, in ns since 1970; in a replay the recorded one, if the recording has it.
     pub wall_ns: u64,
-    /// Random per start of the hub: another value means that the numbers began again.
+    /// Random number of the hub's run. Another value means that `seq` and `topic_seq` started again.
     pub boot: u64,
     /// Position of the sensor's link in the hub's configuration, from 0.
     pub sensor: u8,
-    /// 0 clean, 1 suspect; see [`Quality`].
+    /// Quality of the telegram: [`Quality`].
     pub quality: u8,
-    /// Bits of [`Flags`].
+    /// Flags: [`Flags`].
     pub flags: u8,
-    /// Of which family the sensor is, a number of [`Family`]; see [`family`](Self::family).
+    /// Family of the scanner: [`Family`]; 255 while the hub searches for it.
     pub family: u8,
-    /// Nominal time between two samples of a scan, in us; 0 unknown.
+    /// Nominal period of the scans in microseconds; 0 if unknown.
     pub period_us: u32,
-    /// Process of the hub.
+    /// Process ID of the hub.
     pub hub_pid: u32,
-    /// Why the telegram is suspect: bits of [`Reasons`]; 0 if it is clean.
+    /// Reasons why the telegram is suspect: [`Reasons`]; 0 if it is clean.
     pub reasons: u8,
-    /// From the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; little-endian. FFFFFFh:
-    /// that or more; 0: not known, for samples without a telegram and those of other machines. See
-    /// [`hub_time_ns`](Self::hub_time_ns).
+    /// Time from the telegram's last byte until the sample was sent, in units of 256 ns, rounded up; the low byte is
+    /// first. FFFFFFh means 4.3 s or more. 0 means unknown: the sample has no telegram or comes from another machine.
+    /// See [`hub_time_ns`](Self::hub_time_ns).
     pub hub_time: [u8; 3],
 }
 
@@ -86,13 +86,13 @@ impl Header {
 const HUB_TIME_UNIT_NS: u64 = 256;
 const HUB_TIME_MORE: u32 = 0xFF_FFFF;
 
-/// What the hub thinks of a telegram whose CRC was right.
+/// Quality of a telegram whose checksum was right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Quality {
-    /// Nothing speaks against it.
+    /// No reason to suspect damage.
     Clean = 0,
-    /// Something around it was wrong.
+    /// The telegram may be damaged.
     Suspect = 1,
 }
 
@@ -106,19 +106,19 @@ impl Quality {
     }
 }
 
-/// The bits of [`Header::reasons`].
+/// Reasons to suspect a telegram.
 pub struct Reasons;
 
 impl Reasons {
-    /// The line's error counters moved.
+    /// The driver counted line errors while this telegram or the previous one was read.
     pub const LINE_ERROR: u8 = 1;
-    /// Bytes just before it belonged to nothing.
+    /// The bytes just before the telegram belong to no telegram.
     pub const NEIGHBOUR: u8 = 2;
-    /// It took longer than usual.
+    /// The telegram took longer than usual.
     pub const SLOW: u8 = 4;
     /// Bits are set that the measuring mode never sets.
     pub const FORBIDDEN_BITS: u8 = 8;
-    /// The header of another telegram began inside.
+    /// The header of another telegram started inside.
     pub const HEADER_INSIDE: u8 = 16;
 
     /// Returns the names of the bits that are set, as in all output.
@@ -134,17 +134,17 @@ impl Reasons {
     }
 }
 
-/// The bits of [`Header::flags`]; the numbers are those of the LAN form.
+/// Flags of a sample, with the same numbers as in datagrams.
 pub struct Flags;
 
 impl Flags {
-    /// The port resolves to a pty.
+    /// The scanner is simulated: the port is a pty.
     pub const SIMULATED: u8 = 2;
-    /// The link is a recording.
+    /// The link plays a recording.
     pub const REPLAYED: u8 = 4;
-    /// The stamps were computed, not taken when the bytes arrived.
+    /// The stamps were computed instead of taken when the bytes arrived.
     pub const STAMP_ESTIMATED: u8 = 8;
-    /// The sample came from another machine.
+    /// The sample comes from another machine.
     pub const REMOTE: u8 = 32;
 
     /// Returns the names of the bits that are set, as in all output.

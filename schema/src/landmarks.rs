@@ -14,7 +14,7 @@ pub const MARKS: usize = 64;
 pub struct Marks {
     /// Number of marks, at most [`MARKS`].
     pub count: u8,
-    /// [`Marks::OVERFLOW`], [`Marks::UNAVAILABLE`] and [`Marks::NO_LEVEL`].
+    /// Flags: [`Marks::OVERFLOW`], [`Marks::UNAVAILABLE`], [`Marks::NO_LEVEL`].
     pub flags: u8,
     /// 0.
     pub reserved: u16,
@@ -92,7 +92,7 @@ pub struct Lines {
     pub count: u8,
     /// Number of corners, at most [`LINES`].
     pub corners: u8,
-    /// [`Lines::OVERFLOW`] or 0.
+    /// Flags: [`Lines::OVERFLOW`].
     pub flags: u8,
     /// 0.
     pub reserved: u8,
@@ -115,19 +115,19 @@ pub struct Lines {
 pub struct Line {
     /// Point at which the first beam meets the line, in meters ahead of the robot's center.
     pub x1_m: f32,
-    /// Meters to the left of the center.
+    /// Point at which the first beam meets the line, in meters to the left of the center.
     pub y1_m: f32,
     /// Point at which the last beam meets the line, in meters ahead of the robot's center.
     pub x2_m: f32,
-    /// Meters to the left of the center.
+    /// Point at which the last beam meets the line, in meters to the left of the center.
     pub y2_m: f32,
-    /// Distance of the infinite line from the center: x cos alpha + y sin alpha = r.
+    /// Distance of the infinite line from the center in meters: x cos alpha + y sin alpha = r.
     pub r_m: f32,
     /// Direction from the center to the line's nearest point, in radians from -pi to pi.
     pub alpha_rad: f32,
-    /// Standard deviation of `r_m`.
+    /// Standard deviation of `r_m` in meters.
     pub sd_r_m: f32,
-    /// Standard deviation of `alpha_rad`.
+    /// Standard deviation of `alpha_rad` in radians.
     pub sd_alpha_rad: f32,
     /// First beam.
     pub first: u16,

@@ -14,25 +14,25 @@ use iceoryx2::prelude::ZeroCopySend;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Motion.v2"))]
 #[repr(C)]
 pub struct Motion {
-    /// The summed pose: metres ahead of where the robot's centre was at the start.
+    /// Summed pose: meters ahead of the robot's center at the first scan. It is the sum of all steps, and it drifts.
     pub x_m: f64,
-    /// Metres to the left of it.
+    /// Summed pose: meters to the left of the center at the first scan.
     pub y_m: f64,
-    /// Radians counter-clockwise from where the robot looked at the start, from -pi to pi.
+    /// Summed pose: radians counterclockwise from the robot's direction at the first scan, from -pi to pi.
     pub yaw_rad: f64,
-    /// The step: metres ahead.
+    /// Step: meters ahead, in the robot's frame at the previous scan.
     pub dx_m: f32,
-    /// Metres to the left.
+    /// Step: meters to the left.
     pub dy_m: f32,
-    /// Radians counter-clockwise.
+    /// Step: radians counterclockwise.
     pub dyaw_rad: f32,
-    /// Covariance of the step, row by row, in the order x, y, yaw: m2, m rad and rad2.
+    /// Covariance of the step, row by row, in the order x, y, yaw; in m2, m rad and rad2.
     pub covariance: [f32; 9],
-    /// Share of this scan's readings that lie on surfaces of the scan that it was compared with, 0 to 1.
+    /// Share of this scan's readings that are on surfaces of the scan that it was compared with, 0 to 1.
     pub overlap: f32,
-    /// See [`Motion::how`].
+    /// Method: [`MotionMethod`]. Treat every other number as refused.
     pub method: u8,
-    /// [`Motion::DEGENERATE`], [`Motion::OPEN`].
+    /// Flags: [`Motion::DEGENERATE`], [`Motion::OPEN`].
     pub flags: u8,
     /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
     pub breaks: u16,
@@ -44,21 +44,21 @@ pub struct Motion {
     pub reserved: u32,
 }
 
-/// How a step was found.
+/// Method by which a step was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum MotionMethod {
-    /// It is the first scan: there is no step.
+    /// The scan is the first one, so it has no step.
     First,
-    /// There is no step that explains the scan: nothing is known of it, and of the pose.
+    /// No step explains the scan. Step and summed pose are unknown, and their numbers are 0.
     Refused,
-    /// By the beams alone: no corner and no line of the one scan is one of the other.
+    /// Beams alone: no corner and no line was found in both scans.
     Beams,
-    /// Corners of both scans are the same.
+    /// Corners that are in both scans.
     Points,
-    /// Lines of both scans are the same.
+    /// Lines that are in both scans.
     Lines,
-    /// Corners and lines.
+    /// Corners and lines that are in both scans.
     Both,
 }
 
@@ -99,8 +99,8 @@ impl Default for Motion {
 }
 
 impl Motion {
-    /// Flag: the surroundings do not say how far the robot moved in some direction, as in a corridor. The covariance is
-    /// great there.
+    /// Flag: the surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance
+    /// is large there.
     pub const DEGENERATE: u8 = 1;
     /// Flag: a step since the start was degenerate, so the summed pose may be off by any distance.
     pub const OPEN: u8 = 2;

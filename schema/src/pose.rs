@@ -4,22 +4,22 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-/// A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's centre. 32 bytes.
+/// A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's center. 32 bytes.
 ///
 /// The default is a sensor at the centre that looks ahead.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v2"))]
 #[repr(C)]
 pub struct Pose {
-    /// Metres ahead of the centre.
+    /// Position of the sensor, in meters ahead of the robot's center.
     pub x_m: f64,
-    /// Metres to the left of the centre.
+    /// Position of the sensor, in meters to the left of the robot's center.
     pub y_m: f64,
-    /// Where the sensor looks, in radians counter-clockwise from ahead.
+    /// Direction of the sensor, in radians counterclockwise from ahead.
     pub yaw_rad: f64,
-    /// 1: mounted upside down, so that its first beam is the leftmost.
+    /// 1 if the sensor is mounted upside down, so that its first beam is the leftmost.
     pub upside_down: u8,
-    /// 0.
+    /// 0. In a status, the first one is 1 if a threshold for reflectors (`marks.level`) is configured.
     pub reserved: [u8; 7],
 }
 

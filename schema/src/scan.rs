@@ -19,8 +19,8 @@ pub(crate) use family::{REFLECTOR_MODE, has_reflector_bits};
 /// Maximum number of beams of a scan, in any family.
 pub const BEAMS: usize = 8192;
 
-/// Bits of [`ScanHead::contents`]: the arrays that a scan has in addition to the ranges, each with a value for every
-/// beam.
+/// Arrays that a scan has in addition to the ranges, each with a value for every beam. Bits of
+/// [`ScanHead::contents`].
 pub struct Contents;
 
 impl Contents {
@@ -36,7 +36,7 @@ impl Contents {
     pub const ALL: u8 = 7;
 }
 
-/// Head of a [`Scan`], before the arrays. 64 bytes.
+/// Head of a scan, before the arrays. 64 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ScanHead {
@@ -62,11 +62,11 @@ pub struct ScanHead {
     pub beyond: u16,
     /// Number of points that were dropped because another point has the same beam. Points without a return count, too.
     pub collapsed: u16,
-    /// See [`Family`].
+    /// Family of the scanner: [`Family`].
     pub family: u8,
-    /// [`Scan::INCOMPLETE`] or 0.
+    /// Flags: [`Scan::INCOMPLETE`].
     pub flags: u8,
-    /// Bits of [`Contents`].
+    /// Arrays that follow the head: [`Contents`].
     pub contents: u8,
     /// Bits of an intensity; 0 if there are none.
     pub intensity_bits: u8,

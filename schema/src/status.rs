@@ -18,33 +18,33 @@ pub const COUNTERS: usize = 28;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v2"))]
 #[repr(C)]
 pub struct Status {
-    /// See [`Status::state`].
+    /// State of the link: [`State`].
     pub state: u8,
-    /// The sensor's measuring-mode byte; FFh unknown.
+    /// Measuring mode of an LMS; 255 if unknown.
     pub mode: u8,
-    /// Millimetres per device unit: 1, 10 or 100; 0 unknown.
+    /// Millimeters per device unit: 1, 10 or 100; 0 if unknown.
     pub unit_mm: u8,
-    /// See [`Status::family`].
+    /// Family of the scanner: [`Family`]; 255 while the hub searches for it.
     pub family: u8,
-    /// Rate of the line in bits per second; 0 unknown.
+    /// Baud rate of the line; 0 if unknown.
     pub baud: u32,
-    /// CLOCK_MONOTONIC when the state began, in ns.
+    /// Stamp of the start of the state, in ns of CLOCK_MONOTONIC.
     pub since_ns: u64,
-    /// Scans per second, in mHz; 0 while it is not measured, see [`Status::rate_hz`].
+    /// Scans per second in 1/1000; 0 while they are not measured. See [`Status::rate_hz`].
     pub rate_mhz: u32,
-    /// Field of view in degrees: 100 or 180; 0 unknown.
+    /// Field of view in degrees: 100 or 180; 0 if unknown.
     pub angle_deg: u16,
-    /// Angle between two beams in 1/100 degree; 0 unknown.
+    /// Angle between two beams in 1/100 degree; 0 if unknown.
     pub resolution_cdeg: u16,
-    /// See [`Status::sensor_type`].
+    /// Type that the scanner reports; empty if unknown. See [`Status::sensor_type`].
     pub type_text: [u8; 24],
-    /// See [`Status::port`].
+    /// Port that the link is configured for. See [`Status::port`].
     pub port_text: [u8; 128],
-    /// See [`Status::last_error`].
+    /// Last error; empty if there was none. See [`Status::last_error`].
     pub last_error_text: [u8; Status::MAX_ERROR_LEN],
-    /// See [`Counter`].
+    /// Counters: [`Counter`].
     pub counters: Counters,
-    /// The pose of the sensor, as configured. The first of its reserved bytes belongs to the status, see
+    /// Pose of the sensor, as configured. The first of its reserved bytes belongs to the status, see
     /// [`Status::has_mark_level`].
     pub pose: Pose,
 }
@@ -227,23 +227,23 @@ const WELL: f64 = 0.001;
 /// Flag in the first reserved byte of the pose: a threshold for reflectors is configured.
 const MARK_LEVEL: u8 = 1;
 
-/// What the link is doing.
+/// State of a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum State {
     /// The port does not exist.
     Absent = 0,
-    /// Looking for the sensor and its baud rate.
+    /// The hub searches for the scanner and its baud rate.
     Probing = 1,
-    /// Changing the baud rate.
+    /// The hub changes the baud rate.
     Switching = 2,
-    /// Asking what the sensor is and switching its stream on.
+    /// The hub requests the scanner's properties and starts its stream.
     Starting = 3,
     /// Telegrams arrive.
     Streaming = 4,
-    /// Telegrams arrived and stopped.
+    /// No telegrams arrive any more.
     Silent = 5,
-    /// Stopped on request.
+    /// The link is paused on request.
     Paused = 6,
 }
 

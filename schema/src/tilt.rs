@@ -38,7 +38,7 @@ impl Tilt {
     }
 }
 
-/// Head of a [`Cloud`], before the points. 16 bytes.
+/// Head of a cloud, before the points. 16 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct CloudHead {
@@ -46,9 +46,9 @@ pub struct CloudHead {
     pub sweep: u32,
     /// Generation of the background that the points were compared with. Each reset increases it by 1.
     pub generation: u32,
-    /// Number of points.
+    /// Number of points, at most [`BEAMS`](crate::BEAMS).
     pub count: u16,
-    /// Bits: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`DOUBTED`](Cloud::DOUBTED).
+    /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`DOUBTED`](Cloud::DOUBTED).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 5],
@@ -69,7 +69,7 @@ pub struct CloudPoint {
     pub at: [f32; 3],
     /// Index of the beam in its scan.
     pub beam: u16,
-    /// See [`PointClass`].
+    /// Class of the point: [`PointClass`]. Treat every other number as unknown.
     pub point_class: u8,
     /// 0.
     pub reserved: u8,
@@ -231,15 +231,15 @@ pub const OBSTACLES: usize = 64;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacles.v2"))]
 #[repr(C)]
 pub struct Obstacles {
-    /// Number of the sweep, as in a [`Cloud`].
+    /// Number of the sweep, as in topic `cloud`.
     pub sweep: u32,
-    /// Generation of the background, as in a [`Cloud`].
+    /// Generation of the background, as in topic `cloud`.
     pub generation: u32,
     /// Number of obstacles that did not fit.
     pub left_out: u32,
     /// Number of obstacles, at most [`OBSTACLES`].
     pub count: u8,
-    /// Bits: [`COMPLETE`](Self::COMPLETE), [`DOUBTED`](Self::DOUBTED).
+    /// Flags: [`COMPLETE`](Self::COMPLETE), [`DOUBTED`](Self::DOUBTED).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 2],
@@ -253,17 +253,17 @@ pub struct Obstacles {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacle.v2"))]
 #[repr(C)]
 pub struct Obstacle {
-    /// Mean of the points.
+    /// Mean of the points, in meters.
     pub middle: [f32; 3],
-    /// Lowest coordinates of the points.
+    /// Lowest coordinates of the points, in meters.
     pub low: [f32; 3],
-    /// Highest coordinates of the points.
+    /// Highest coordinates of the points, in meters.
     pub high: [f32; 3],
     /// Horizontal distance of the nearest point from the robot's center, in meters.
     pub distance_m: f32,
     /// Number of points.
     pub points: u32,
-    /// Bits: [`FOREGROUND`](Self::FOREGROUND), [`NEAR`](Self::NEAR).
+    /// Flags: [`FOREGROUND`](Self::FOREGROUND), [`NEAR`](Self::NEAR).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 3],

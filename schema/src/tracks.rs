@@ -52,9 +52,9 @@ pub struct Track {
     pub age_ms: u32,
     /// Bit i is set if sensor i of the sample sees the person.
     pub sensors: u32,
-    /// Name of the room in UTF-8, padded with 0; see [`room_name`](Track::room_name).
+    /// Name of the room; empty outside of all rooms. See [`room_name`](Track::room_name).
     pub room_text: [u8; 24],
-    /// See [`TrackState`].
+    /// State of the track: [`TrackState`]. Treat every other number as tentative.
     pub state: u8,
     /// 0.
     pub reserved: [u8; 7],
@@ -75,7 +75,7 @@ pub struct TrackSensor {
     pub upside_down: u8,
     /// 0.
     pub reserved: [u8; 3],
-    /// Name as clients use it, padded with 0; see [`name`](TrackSensor::name).
+    /// Name as clients use it. See [`name`](TrackSensor::name).
     pub name_text: [u8; 56],
 }
 
@@ -203,7 +203,7 @@ impl TrackSensor {
 pub struct Event {
     /// ID of the person in topic `tracks`.
     pub id: u64,
-    /// See [`EventKind`].
+    /// Kind of the event: [`EventKind`].
     pub kind: u8,
     /// 0.
     pub reserved: [u8; 7],

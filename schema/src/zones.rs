@@ -12,7 +12,7 @@ pub const ZONES: usize = 8;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zones.v2"))]
 #[repr(C)]
 pub struct Zones {
-    /// See [`Zones::verdict`].
+    /// Verdict: [`Verdict`]. Treat unknown, and every other number, as stop.
     pub verdict: u8,
     /// Number of zones, at most [`ZONES`].
     pub count: u8,
@@ -22,7 +22,7 @@ pub struct Zones {
     pub nearest_mm: u32,
     /// Number of beams without a valid reading among those that cross the largest zone.
     pub invalid_beams: u16,
-    /// [`Zones::PROVISIONAL`] or 0.
+    /// Flags: [`Zones::PROVISIONAL`].
     pub flags: u8,
     /// 0.
     pub reserved: u8,
@@ -142,14 +142,15 @@ impl Verdict {
 }
 
 /// The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
-/// the same or a higher number belong to its scan and confirm it. A sample with [`Early::WITHDRAWN`] withdraws it.
+/// the same or a higher number belong to its scan and confirm it. A sample with [`Early::WITHDRAWN`]
+/// withdraws it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Early.v2"))]
 #[repr(C)]
 pub struct Early {
-    /// See [`Verdict`]: slow or stop, never clear or unknown.
+    /// Verdict: [`Verdict`]. An early warning is slow or stop, never clear or unknown.
     pub verdict: u8,
-    /// [`Early::WITHDRAWN`] or 0.
+    /// Flags: [`Early::WITHDRAWN`].
     pub flags: u8,
     /// Beam of the nearest point so far.
     pub beam: u16,

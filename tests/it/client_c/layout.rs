@@ -1,68 +1,40 @@
-//! The payloads as Rust lays them out, and a program that says how C does: every field of every one, so that nothing lies
-//! between two of them.
+//! The layouts of all payloads, and a program that reports the layouts of C: offset and size of every field.
 
-use std::mem::{offset_of, size_of};
-
-use schema::{
-    BackgroundHead, CloudHead, CloudPoint, Contents, Counter, Family, ForegroundHead, Header, Mark, Marks,
-    Obstacle, Obstacles, Pose, Scan, ScanHead, Segment, Status, Tilt, Zone, Zones,
-};
+use schema::{Contents, Counter, Family, Header, Scan, ScanHead};
 
 struct Layout {
-    /// In C.
-    name: &'static str,
+    /// Name in C.
+    name: String,
+    /// Size in bytes.
     size: usize,
-    /// Name, offset, size.
-    fields: Vec<(&'static str, usize, usize)>,
+    /// Name, offset and size in bytes.
+    fields: Vec<(String, usize, usize)>,
 }
 
-fn size_of_field<T, F>(_: impl Fn(&T) -> &F) -> usize {
-    size_of::<F>()
-}
-
-macro_rules! layouts {
-    ($($name:literal $payload:ty: $($field:ident)*;)*) => {
-        vec![$(Layout {
-            name: $name,
-            size: size_of::<$payload>(),
-            fields: vec![$((
-                stringify!($field),
-                offset_of!($payload, $field),
-                size_of_field(|payload: &$payload| &payload.$field),
-            ),)*],
-        },)*]
-    };
-}
-
+/// Returns the layouts of `tests/vectors/v2/layouts.txt`, which come from the Rust structs.
 fn layouts() -> Vec<Layout> {
-    let layouts = layouts! {
-        "scanhub_header_v2" Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags family
-            period_us hub_pid reasons hub_time;
-        "scanhub_scan_v2" ScanHead: first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return
-            beyond collapsed family flags contents intensity_bits turns reserved turn_ns reserved2;
-        "scanhub_mark_v2" Mark: angle_mdeg range_dmm weight peak edge first_beam last_beam;
-        "scanhub_marks_v2" Marks: count flags reserved mark_array;
-        "scanhub_zone_v2" Zone: radius_mm beams violated reserved;
-        "scanhub_zones_v2" Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array;
-        "scanhub_segment_v2" Segment: first last nearest width x_mm y_mm;
-        "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out supported;
-        "scanhub_background_v2" BackgroundHead: first_angle step generation unit_um taught count flags reserved;
-        "scanhub_pose_v2" Pose: x_m y_m yaw_rad upside_down reserved;
-        "scanhub_tilt_v2" Tilt: angle_rad rate_rad_s;
-        "scanhub_cloud_v2" CloudHead: sweep generation count flags reserved;
-        "scanhub_cloud_point_v2" CloudPoint: at beam point_class reserved;
-        "scanhub_obstacle_v2" Obstacle: middle low high distance_m points flags reserved;
-        "scanhub_obstacles_v2" Obstacles: sweep generation left_out count flags reserved obstacle_array;
-        "scanhub_status_v2" Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg
-            type_text port_text last_error_text counters pose;
-    };
-    for layout in &layouts {
-        let mut end = 0;
-        for (field, offset, size) in &layout.fields {
-            assert_eq!(*offset, end, "{} has something before {field}", layout.name);
-            end = offset + size;
+    let mut layouts: Vec<Layout> = Vec::new();
+    for line in include_str!("../../vectors/v2/layouts.txt").lines().filter(|line| !line.starts_with("    "))
+    {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let number: usize = words[1].parse().expect("a number");
+        match layouts.last_mut().filter(|_| line.starts_with(' ')) {
+            None => {
+                let rust = words[0].split('.').nth(1).expect("a name");
+                let mut name = "scanhub".to_owned();
+                for letter in rust.strip_suffix("Head").unwrap_or(rust).chars() {
+                    name.extend(letter.is_uppercase().then_some('_'));
+                    name.extend(letter.to_lowercase());
+                }
+                layouts.push(Layout { name: name + "_v2", size: number, fields: Vec::new() });
+            }
+            Some(layout) => {
+                if let Some((_, at, size)) = layout.fields.last_mut() {
+                    *size = number - *at;
+                }
+                layout.fields.push((words[0].to_owned(), number, layout.size - number));
+            }
         }
-        assert_eq!(end, layout.size, "{} has something at its end", layout.name);
     }
     layouts
 }

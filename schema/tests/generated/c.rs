@@ -1,0 +1,198 @@
+//! Structs and constants of `attach.h`, for samples in shared memory.
+
+use std::fmt::Write as _;
+
+use schema::Topic;
+
+use super::description::{Description, Field, Kind, Layout, Set, snake};
+use super::{rules, wrap};
+
+const WIDTH: usize = 120;
+
+/// Returns the numbers of the topics, the structs, and the constants that their fields can have.
+pub(crate) fn structs(description: &Description) -> String {
+    let mut text = "/* Topics, and the struct that a payload is or starts with. */\n".to_owned();
+    let longest = Topic::ALL.iter().map(|topic| topic.name().len()).max().unwrap_or_default();
+    for topic in Topic::ALL {
+        let name = topic.name().to_uppercase();
+        let about = match description.payload(topic) {
+            Some(layout) => format!("struct {}", type_name(&layout.name)),
+            None => "length bytes: a telegram of an LMS from STX to CRC, or whole packets of other families"
+                .to_owned(),
+        };
+        let number = format!("{:<2}", topic.number());
+        let define = format!("#define SCANHUB_TOPIC_{name:<longest$} {number}");
+        writeln!(text, "{define} /* {about} */").expect("a String");
+    }
+    let mut written = Vec::new();
+    for layout in &description.layouts {
+        for set in layout.fields.iter().filter_map(|field| field.set.as_ref()) {
+            if !written.contains(set) && shared(set).is_none() {
+                text += &constants(set, &description.sets[set], layout);
+                written.push(set.clone());
+            }
+        }
+        text += &one(layout);
+    }
+    text
+}
+
+/// Returns the name of a struct in C.
+pub(crate) fn type_name(name: &str) -> String {
+    format!("scanhub_{}_v2", snake(name))
+}
+
+/// Returns the start of the names of a set's constants.
+fn prefix(set: &str) -> String {
+    let name = match set {
+        "Contents" => "scan".to_owned(),
+        "Scan" => "scan_flag".to_owned(),
+        "Flags" => "flag".to_owned(),
+        "Reasons" => "reason".to_owned(),
+        "MotionMethod" => "method".to_owned(),
+        "TrackState" => "track".to_owned(),
+        "EventKind" => "event".to_owned(),
+        "Cloud" | "Obstacles" => "sweep".to_owned(),
+        "PointClass" => "class".to_owned(),
+        name => snake(name),
+    };
+    format!("SCANHUB_{}_", name.to_uppercase())
+}
+
+/// Returns the set with whose constants a set is written, if that is another one.
+fn shared(set: &str) -> Option<&'static str> {
+    (set == "Obstacles").then_some("Cloud")
+}
+
+fn constants(name: &str, set: &Set, layout: &Layout) -> String {
+    let prefix = prefix(name);
+    let doc = match set.doc.as_str() {
+        "" => format!("Flags of struct {}.", type_name(&layout.name)),
+        doc => doc.to_owned(),
+    };
+    let mut text = format!("\n{}", above("", &doc));
+    if name == "Counter" {
+        text += "enum scanhub_counter {\n";
+        let last = set.values.last().map(|value| value.number);
+        for value in &set.values {
+            let comma = if Some(value.number) == last { "" } else { "," };
+            text += &commented(&format!("    {prefix}{}{comma}", value.name.to_uppercase()), &value.doc);
+        }
+        return text + "};\n";
+    }
+    let longest = set.values.iter().map(|value| value.name.len()).max().unwrap_or_default();
+    for value in &set.values {
+        let name = value.name.to_uppercase();
+        text += &commented(&format!("#define {prefix}{name:<longest$} {}", value.number), &value.doc);
+    }
+    text
+}
+
+fn one(layout: &Layout) -> String {
+    let name = type_name(&layout.name);
+    let mut doc = layout.doc.clone();
+    let arrays = rules::tail(&layout.name).iter().map(|array| {
+        let kind = if array.kind.starts_with(char::is_uppercase) {
+            format!("struct {}", type_name(array.kind))
+        } else {
+            number_name(array.kind).to_owned()
+        };
+        format!("{} ({kind})", array.name)
+    });
+    let arrays: Vec<_> = arrays.collect();
+    if !arrays.is_empty() {
+        doc +=
+            &format!(" The arrays that follow: {}. Use the functions below to read them.", arrays.join(", "));
+    }
+    let mut text = format!("\n{}struct {name} {{\n", above("", &doc));
+    for field in &layout.fields {
+        text += &commented(&declaration(field), &comment(field));
+    }
+    text + "};\n"
+}
+
+fn declaration(field: &Field) -> String {
+    let kind = match &field.kind {
+        Kind::Text => "char".to_owned(),
+        Kind::Number(number) => number_name(number).to_owned(),
+        Kind::Layout(rust) => format!("struct {}", type_name(rust)),
+    };
+    let len = field.len.map_or(String::new(), |len| format!("[{len}]"));
+    format!("    {kind} {}{len};", field.name)
+}
+
+/// Returns the name of a number's type in C.
+pub(crate) fn number_name(number: &str) -> &'static str {
+    match number {
+        "u8" => "uint8_t",
+        "u16" => "uint16_t",
+        "u32" => "uint32_t",
+        "u64" => "uint64_t",
+        "i8" => "int8_t",
+        "i16" => "int16_t",
+        "i32" => "int32_t",
+        "i64" => "int64_t",
+        "f32" => "float",
+        "f64" => "double",
+        _ => panic!("{number} has no type in C"),
+    }
+}
+
+fn comment(field: &Field) -> String {
+    let values = match field.set.as_deref() {
+        Some("Counter") => "by enum scanhub_counter".to_owned(),
+        Some(set) => format!("{}..", prefix(set)),
+        None => String::new(),
+    };
+    let text = match field.kind {
+        Kind::Text => format!("{} UTF-8, padded with 0; a text that fills it has no 0.", field.doc(&values)),
+        _ => field.doc(&values),
+    };
+    if text == "0." { String::new() } else { text }
+}
+
+/// Returns a line with its comment, which is above it if it is too long.
+fn commented(line: &str, comment: &str) -> String {
+    let indent = &line[..line.len() - line.trim_start().len()];
+    let beside = format!("{line} /* {comment} */");
+    if comment.is_empty() {
+        format!("{line}\n")
+    } else if beside.len() <= WIDTH {
+        format!("{beside}\n")
+    } else {
+        above(indent, comment) + line + "\n"
+    }
+}
+
+/// Returns a comment in lines of its own.
+fn above(indent: &str, comment: &str) -> String {
+    // The end of the comment stays on the line of the last word.
+    let lines = wrap(&format!("{indent}/* "), &format!("{indent} * "), &format!("{comment}\u{1}*/"), WIDTH);
+    lines.replace('\u{1}', " ")
+}
+
+/// Returns the checks with which a compiler that has another layout stops.
+pub(crate) fn checks(description: &Description) -> String {
+    let mut text = String::new();
+    for layout in &description.layouts {
+        let name = type_name(&layout.name);
+        writeln!(text, "SCANHUB_SIZE({name}, {});", layout.size).expect("a String");
+        for field in &layout.fields {
+            writeln!(text, "SCANHUB_AT({name}, {}, {});", field.name, field.at).expect("a String");
+        }
+    }
+    text
+}
+
+/// Returns the topics of the structs, for C++.
+pub(crate) fn topics(description: &Description) -> String {
+    let mut text = String::new();
+    for topic in Topic::ALL {
+        if let Some(layout) = description.payload(topic) {
+            let (kind, topic) = (type_name(&layout.name), topic.name().to_uppercase());
+            let number = format!("enum {{ number = SCANHUB_TOPIC_{topic} }};");
+            writeln!(text, "template <> struct TopicOf<{kind}> {{ {number} }};").expect("a String");
+        }
+    }
+    text
+}

@@ -1,0 +1,119 @@
+//! Tables of `docs/topics.md` and `docs/datagram.md`.
+
+use std::fmt::Write as _;
+
+use schema::Topic;
+
+use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first};
+use super::rules::{self, Tail};
+
+const HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
+
+/// Returns the tables of the layout, of the layouts in it, and of the elements of its arrays.
+pub(crate) fn tables(description: &Description, layout: &Layout) -> String {
+    let tail = rules::tail(&layout.name);
+    let what = if tail.is_empty() { "" } else { " and arrays" };
+    let mut text = format!("\n`scanhub.{}.v2`, {} bytes{what}:\n\n{HEAD}", layout.name, layout.size);
+    let mut inner = rows(description, layout, &mut text);
+    let mut at = Some(layout.size);
+    for array in tail {
+        let offset = at.map_or(String::new(), |at| format!(" {at}"));
+        let element = description.layouts.iter().find(|layout| layout.rust == array.kind);
+        let kind = match element {
+            Some(element) => format!("{} times {} bytes", array.count, element.size),
+            None => format!("{}[{}]", array.kind, array.count),
+        };
+        let condition =
+            array.only_if.map_or(String::new(), |(field, bit)| format!(", if `{field}` has bit {bit}"));
+        let doc = lower_first(array.doc.trim_end_matches('.'));
+        writeln!(text, "|{offset} | {kind} | `{}`{condition}: {doc} |", array.name).expect("a String");
+        at = at
+            .zip(array.count.parse::<usize>().ok())
+            .zip(element)
+            .map(|((at, count), of)| at + count * of.size);
+        inner.extend(element);
+    }
+    for layout in inner {
+        write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n{HEAD}", layout.name, layout.size).expect("a String");
+        rows(description, layout, &mut text);
+    }
+    text + "\n"
+}
+
+/// Writes the rows of all fields. Returns the layouts in them.
+fn rows<'a>(description: &'a Description, layout: &Layout, text: &mut String) -> Vec<&'a Layout> {
+    let mut inner = Vec::new();
+    for field in &layout.fields {
+        let kind = match (&field.kind, field.len) {
+            (Kind::Layout(rust), len) => {
+                inner.push(description.layout(rust));
+                len.map_or(String::new(), |len| format!("{len} times ")) + &format!("{} bytes", field.element)
+            }
+            (Kind::Text, Some(len)) => format!("char[{len}]"),
+            _ => field.kind_name(),
+        };
+        let about = about(description, field);
+        writeln!(text, "| {} | {kind} | {about} |", field.at).expect("a String");
+    }
+    inner
+}
+
+fn about(description: &Description, field: &Field) -> String {
+    let values = field.set.as_ref().map_or(String::new(), |set| {
+        let set = &description.sets[set];
+        let values = set.values.iter().map(|value| {
+            let doc = first_sentence(&value.doc);
+            if set.values.len() > 10 || doc.is_empty() {
+                value.name.clone()
+            } else {
+                format!("{} {} ({doc})", value.number, value.name.replace('_', " "))
+            }
+        });
+        values.collect::<Vec<_>>().join(", ")
+    });
+    let doc = field.doc(&values);
+    if doc == "0." {
+        return "0".to_owned();
+    }
+    let doc = lower_first(doc.trim_end_matches('.'));
+    let doc = doc.strip_prefix(&format!("{}: ", field.name)).unwrap_or(&doc);
+    format!("`{}`: {doc}", field.name)
+}
+
+/// Returns the table of the payloads in datagrams.
+pub(crate) fn payloads(description: &Description) -> String {
+    let mut text = "\n| topic | offset | size | |\n|---|---|---|---|\n".to_owned();
+    for topic in Topic::ALL {
+        let Some(layout) = description.payload(topic) else { continue };
+        let name = format!("`scanhub.{}.v2`", layout.name);
+        let head = rules::head(layout);
+        let arrays: Vec<_> = layout.fields[head.fields..].iter().collect();
+        let tail = rules::packed_tail(&layout.name);
+        let whole = arrays.is_empty() && tail.is_empty();
+        let what = if whole { name } else { format!("head of {name}") };
+        let counts = rules::counts(layout);
+        let limits: String =
+            counts.iter().map(|(count, most)| format!("; `{count}` is at most {most}")).collect();
+        writeln!(text, "| {} | 0 | {} | {what}{limits} |", topic.name(), head.size).expect("a String");
+        let mut at = format!(" {}", head.size);
+        let mut row = |size: String, about: String| {
+            writeln!(text, "| |{at} | {size} | {about} |").expect("a String");
+            at = String::new();
+        };
+        for field in arrays {
+            let count = rules::count_of(layout, field);
+            row(format!("{} {count}", field.element), format!("the used elements of `{}`", field.name));
+        }
+        for Tail { name, kind, count, only_if, .. } in tail {
+            let (element, of) = match description.layouts.iter().find(|layout| layout.rust == *kind) {
+                Some(layout) => (layout.size, format!("`scanhub.{}.v2`", layout.name)),
+                None => (rules::number_size(kind), (*kind).to_owned()),
+            };
+            let condition =
+                only_if.map_or(String::new(), |(field, bit)| format!(", if `{field}` has bit {bit}"));
+            let size = if element == 1 { (*count).to_owned() } else { format!("{element} {count}") };
+            row(size, format!("`{name}`, each {of}{condition}"));
+        }
+    }
+    text + "\n"
+}

@@ -1,0 +1,87 @@
+//! Generates the layouts of all payloads for other languages from the Rust structs, and checks that the committed files
+//! are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated` writes
+//! them.
+
+mod c;
+mod description;
+mod docs;
+mod rules;
+
+use std::path::Path;
+use std::{env, fs};
+
+use description::Description;
+
+const COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
+
+/// Compares the file with `text`, or writes it.
+fn check(path: &str, text: &str) {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
+    if fs::read_to_string(&file).expect("a committed file") == text {
+        return;
+    }
+    assert!(env::var_os("SCANHUB_WRITE").is_some(), "{path} is not up to date: {COMMAND}");
+    fs::write(file, text).expect("a writable file");
+}
+
+/// Compares or writes the blocks of the file. A block is between a line with `COMMAND: NAME` and the next one with
+/// `End of NAME`.
+fn check_blocks(path: &str, blocks: &[(&str, String)]) {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
+    let mut text = fs::read_to_string(file).expect("a committed file");
+    for (name, block) in blocks {
+        let begin = format!("{COMMAND}: {name}");
+        let line = |of: &str, from: usize| {
+            let at = from + text[from..].find(of).unwrap_or_else(|| panic!("{path} has no line with {of:?}"));
+            (text[..at].rfind('\n').map_or(0, |at| at + 1), at + text[at..].find('\n').expect("an end") + 1)
+        };
+        let (_, from) = line(&begin, 0);
+        let (to, _) = line(&format!("End of {name}"), from);
+        text.replace_range(from..to, block);
+    }
+    check(path, &text);
+}
+
+/// Returns `text` in lines of at most `width` columns, the first one after `first` and the others after `next`.
+fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
+    let mut lines = Vec::new();
+    let mut line = first.to_owned();
+    let mut is_empty = true;
+    for word in text.split(' ') {
+        if !is_empty && line.len() + word.len() >= width {
+            lines.push(line.trim_end().to_owned());
+            line = next.to_owned();
+            is_empty = true;
+        }
+        line += if is_empty { "" } else { " " };
+        line += word;
+        is_empty = false;
+    }
+    lines.push(line);
+    lines.join("\n") + "\n"
+}
+
+#[test]
+fn layouts_are_up_to_date() {
+    check("tests/vectors/v2/layouts.txt", &Description::read().text());
+}
+
+#[test]
+fn c_is_up_to_date() {
+    let description = Description::read();
+    let blocks = [("structs", c::structs(&description)), ("checks", c::checks(&description))];
+    check_blocks("clients/c/include/scanhub/attach.h", &blocks);
+    check_blocks("clients/c/include/scanhub/attach.hpp", &[("topics", c::topics(&description))]);
+}
+
+#[test]
+fn pages_are_up_to_date() {
+    let description = Description::read();
+    let layouts = ["Header"].into_iter().map(|rust| description.layout(rust));
+    let layouts =
+        layouts.chain(schema::Topic::ALL.into_iter().filter_map(|topic| description.payload(topic)));
+    let tables: Vec<_> =
+        layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
+    check_blocks("docs/topics.md", &tables);
+    check_blocks("docs/datagram.md", &[("payloads", docs::payloads(&description))]);
+}
