@@ -5,6 +5,8 @@
 mod c;
 mod description;
 mod docs;
+mod python;
+mod readers;
 mod rules;
 
 use std::path::Path;
@@ -84,4 +86,16 @@ fn pages_are_up_to_date() {
         layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
     check_blocks("docs/topics.md", &tables);
     check_blocks("docs/datagram.md", &[("payloads", docs::payloads(&description))]);
+}
+
+#[test]
+fn python_is_up_to_date() {
+    let description = Description::read();
+    let blocks = [
+        ("constants", python::constants(&description)),
+        ("classes", python::classes(&description)),
+        ("union", python::union(&description)),
+        ("readers", python::functions(&description)),
+    ];
+    check_blocks("clients/python/scanhub_lan.py", &blocks);
 }

@@ -1,0 +1,159 @@
+//! Fields as the readers of datagrams show them, and the conditions that a valid payload meets.
+
+use std::collections::BTreeMap;
+
+use super::description::{Field, Kind, Layout, Set};
+use super::rules::head;
+
+/// A field as the readers of datagrams show it.
+pub(crate) struct Shown<'a> {
+    /// Name in Python and Lua, and in C unless [`name_in_c`] has another one.
+    pub(crate) name: String,
+    pub(crate) field: &'a Field,
+    /// Index of the first element in the field.
+    pub(crate) index: usize,
+    pub(crate) how: How,
+}
+
+pub(crate) enum How {
+    /// As it is: a number, a text, an array of numbers, or a struct.
+    Plain,
+    /// 1 if it is true.
+    Bool,
+    /// A bit of flags, with the comment of its constant.
+    Bit(u64, String),
+    /// One element of an array.
+    Element(&'static str),
+    /// A value that each reader computes, with its comment.
+    Computed(&'static str),
+}
+
+/// Fields that are 1 if they are true.
+const BOOLS: [(&str, &str); 3] =
+    [("Pose", "upside_down"), ("TrackSensor", "upside_down"), ("Zone", "violated")];
+
+/// Flags that the readers do not show.
+const HIDDEN: [(&str, &str); 2] = [("Marks", "no_level"), ("Motion", "open")];
+
+const NAMES: [(&str, &str, &str); 6] = [
+    ("TrackSensor", "x_m", "site_x_m"),
+    ("TrackSensor", "y_m", "site_y_m"),
+    ("Event", "from", "from_room"),
+    ("Event", "to", "to_room"),
+    ("Obstacle", "low", "low_m"),
+    ("Obstacle", "high", "high_m"),
+];
+
+/// Arrays of coordinates that are shown as three fields.
+const POSITIONS: [(&str, &str); 2] = [("CloudPoint", "at"), ("Obstacle", "middle")];
+const COORDINATES: [(&str, &str); 3] = [
+    ("x_m", "meters ahead of the robot's center"),
+    ("y_m", "meters to the left of the center"),
+    ("z_m", "meters above the floor"),
+];
+
+/// Values that are computed from others, in place of flags: layout, name and comment.
+pub(crate) const COMPUTED: [(&str, &str, &str); 1] =
+    [("Motion", "valid", "Whether the summed pose is known, and none of its steps was degenerate.")];
+
+/// Returns the fields before the first array, as the readers show them.
+pub(crate) fn shown<'a>(layout: &'a Layout, sets: &BTreeMap<String, Set>) -> Vec<Shown<'a>> {
+    let rust = layout.rust.as_str();
+    let mut shown = Vec::new();
+    for field in
+        layout.fields[..head(layout).fields].iter().filter(|field| !field.name.starts_with("reserved"))
+    {
+        let name = field.name.strip_suffix("_text").unwrap_or(&field.name);
+        let plain = |how| {
+            let renamed = NAMES.iter().find(|(of, from, _)| *of == rust && *from == name);
+            Shown { name: renamed.map_or(name, |(_, _, to)| to).to_owned(), field, index: 0, how }
+        };
+        if POSITIONS.contains(&(rust, name)) {
+            for (index, (name, doc)) in COORDINATES.into_iter().enumerate() {
+                shown.push(Shown { name: name.to_owned(), field, index, how: How::Element(doc) });
+            }
+        } else if name == "flags" {
+            for (_, name, doc) in COMPUTED.iter().filter(|(of, ..)| *of == rust) {
+                shown.push(Shown { name: (*name).to_owned(), field, index: 0, how: How::Computed(doc) });
+            }
+            let flags = field.set.as_ref().map_or(&[][..], |set| &sets[set].values);
+            for value in flags.iter().filter(|value| !HIDDEN.contains(&(rust, &value.name))) {
+                let how = How::Bit(value.number, value.doc.clone());
+                shown.push(Shown { name: value.name.clone(), field, index: 0, how });
+            }
+        } else if BOOLS.contains(&(rust, name)) {
+            shown.push(plain(How::Bool));
+        } else {
+            shown.push(plain(How::Plain));
+        }
+    }
+    shown
+}
+
+/// A condition that a valid payload meets, besides its length, the limits of its counts and that numbers are finite.
+pub(crate) enum Check {
+    /// Each element of an array has a field below a count of the head.
+    Below { array: &'static str, field: &'static str, count: &'static str },
+    /// Each element of an array has no bit at or above a count of the head.
+    Bits { array: &'static str, field: &'static str, count: &'static str },
+    /// A field has a value in this range.
+    Within { field: &'static str, from: u64, to: u64 },
+}
+
+/// Returns the conditions of a payload.
+pub(crate) fn checks(payload: &str) -> &'static [Check] {
+    match payload {
+        "Scan" => &[Check::Within { field: "contents", from: 0, to: 7 }],
+        "Lines" => &[
+            Check::Below { array: "corner_array", field: "first_line", count: "count" },
+            Check::Below { array: "corner_array", field: "second_line", count: "count" },
+        ],
+        "Early" => &[Check::Within { field: "verdict", from: 1, to: 2 }],
+        "Tracks" => &[Check::Bits { array: "track_array", field: "sensors", count: "sensors" }],
+        "Event" => &[Check::Within { field: "kind", from: 0, to: 2 }],
+        _ => &[],
+    }
+}
+
+/// Which numbers of a field must not be infinite or NaN.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Finite {
+    Must,
+    /// NaN means unknown.
+    MayBeNan,
+    NotChecked,
+}
+
+/// Returns the condition for the numbers of a field.
+pub(crate) fn finite(layout: &Layout, field: &Field) -> Finite {
+    match (layout.rust.as_str(), &field.kind) {
+        (_, Kind::Number(kind)) if !kind.starts_with('f') => Finite::NotChecked,
+        ("Pose", _) => Finite::NotChecked,
+        ("Tilt", _) if field.name == "rate_rad_s" => Finite::MayBeNan,
+        (_, Kind::Number(_)) => Finite::Must,
+        _ => Finite::NotChecked,
+    }
+}
+
+/// Returns the field and the value of it with which a field is unknown.
+pub(crate) fn unknown_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {
+    let is_nearest = layout.name == "Zones" && field.name.starts_with("nearest_");
+    is_nearest.then_some(("nearest_beam", 0xFFFF))
+}
+
+/// Returns the field and the value of it without which a text is empty.
+pub(crate) fn text_only_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {
+    let is_door =
+        layout.name == "Event" && ["door_text", "from_text", "to_text"].contains(&field.name.as_str());
+    is_door.then_some(("kind", 2))
+}
+
+/// Returns the name that stands for unknown numbers of an enum; `None` if they have no name.
+pub(crate) fn other_value(set: &str) -> Option<&'static str> {
+    match set {
+        "Verdict" | "PointClass" => Some("unknown"),
+        "MotionMethod" => Some("refused"),
+        "TrackState" => Some("tentative"),
+        _ => None,
+    }
+}
