@@ -10,7 +10,7 @@ use std::rc::Rc;
 
 use config::Config;
 use daemon::platform::{Line, Platform, SavedState, Wait, WakeReason};
-use daemon::{LiveLink, Orders};
+use daemon::{CommandSender, LiveLink};
 use port::{Allowance, Alteration, PortError, Source, clock};
 use schema::limits::TopicLimits;
 use schema::{Failure, Nanos, Ring, Wake};
@@ -38,7 +38,7 @@ pub(crate) fn virtual_hub<T>(
     shortage::raise_descriptor_limit().expect("a limit can be raised");
     let _lock = HubLock::acquire(domain.root())?;
     let node = shm::hub_node(domain)?;
-    let (_orders, queues) = Orders::new(config.links.iter().map(|link| link.name.as_str()))?;
+    let (_commands, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;
     let platform = config.links.iter().map(|link| VirtualPlatform::new(&node, &link.name));
     let platform = platform.collect::<Result<Vec<_>, _>>()?;
     let mut links = Vec::with_capacity(config.links.len());

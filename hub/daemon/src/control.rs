@@ -18,13 +18,13 @@ use crate::process::EventFd;
 /// The server of control requests. It belongs to the supervising thread.
 pub(crate) struct ControlServer {
     server: shm::ControlServer,
-    pub(crate) orders: Orders,
+    pub(crate) commands: CommandSender,
     /// Requests whose link has not reported an outcome yet, with their numbers.
     open: Vec<(u64, Asked)>,
 }
 
 /// Queues to the threads of all links, and the outcomes that these threads report.
-pub struct Orders {
+pub struct CommandSender {
     links: Vec<LinkQueue>,
     outcomes: Receiver<(u64, Outcome)>,
     event: Arc<EventFd>,
@@ -35,12 +35,12 @@ pub struct Orders {
 struct LinkQueue {
     sensor: String,
     queue: SyncSender<QueuedRequest>,
-    changed: Changed,
+    changed: PendingSettings,
     event: Arc<EventFd>,
 }
 
 /// New settings of the processors of a link, until the link takes them.
-type Changed = Arc<Mutex<Option<Box<Processing>>>>;
+type PendingSettings = Arc<Mutex<Option<Box<Processing>>>>;
 
 /// Outcome of a request: the background model if the request asked for it, or the reason of a failure.
 pub type Outcome = Result<Option<Box<Shown>>, Failure>;
@@ -54,19 +54,21 @@ pub(crate) struct QueuedRequest {
     pub(crate) model: Box<Background>,
 }
 
-impl Orders {
+impl CommandSender {
     /// Creates a queue for the link of each sensor in `sensors`. The second value has the links' ends, in the same order.
     ///
     /// # Errors
     ///
     /// [`Kind::Short`] if no descriptors are left.
-    pub fn new<'a>(sensors: impl Iterator<Item = &'a str>) -> Result<(Orders, Vec<ControlQueue>), Failure> {
+    pub fn new<'a>(
+        sensors: impl Iterator<Item = &'a str>,
+    ) -> Result<(CommandSender, Vec<ControlQueue>), Failure> {
         let event = Arc::new(EventFd::new()?);
-        let (told, outcomes) = channel();
+        let (outcome_sender, outcomes) = channel();
         let (mut links, mut ends) = (Vec::new(), Vec::new());
         for sensor in sensors {
-            let (sender, queue) = sync_channel(QUEUE);
-            let (own, changed) = (Arc::new(EventFd::new()?), Changed::default());
+            let (sender, queue) = sync_channel(QUEUE_CAPACITY);
+            let (own, changed) = (Arc::new(EventFd::new()?), PendingSettings::default());
             links.push(LinkQueue {
                 sensor: sensor.to_owned(),
                 queue: sender,
@@ -79,11 +81,11 @@ impl Orders {
                 queue,
                 changed,
                 event: own,
-                outcomes: told.clone(),
+                outcomes: outcome_sender.clone(),
                 server: event.clone(),
             });
         }
-        Ok((Orders { links, outcomes, event, next: 0 }, ends))
+        Ok((CommandSender { links, outcomes, event, next: 0 }, ends))
     }
 
     /// Gives the link of `sensor` new settings for its processors. They replace settings that the link has not taken
@@ -106,13 +108,13 @@ impl Orders {
     pub fn ask(&mut self, sensor: &str, verb: Verb, model: Box<Background>) -> Result<u64, Failure> {
         let link = self.links.iter().find(|link| link.sensor == sensor).ok_or_else(|| {
             let sensors: Vec<_> = self.links.iter().map(|link| link.sensor.as_str()).collect();
-            let there_are = format!("there are {}", sensors.join(", "));
-            Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), there_are)
+            let hint = format!("there are {}", sensors.join(", "));
+            Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
         })?;
         match link.queue.try_send(QueuedRequest { number: self.next, verb, model }) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
-                let message = format!("{sensor} already has {QUEUE} waiting requests");
+                let message = format!("{sensor} already has {QUEUE_CAPACITY} waiting requests");
                 return Err(Failure::new(Kind::Short, message, "try again in a moment"));
             }
             Err(TrySendError::Disconnected(_)) => {
@@ -141,19 +143,19 @@ impl ControlServer {
         sensors: impl Iterator<Item = &'a str>,
     ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
         let server = shm::ControlServer::create(node)?;
-        let (orders, queues) = Orders::new(sensors)?;
-        Ok((ControlServer { server, orders, open: Vec::new() }, queues))
+        let (commands, queues) = CommandSender::new(sensors)?;
+        Ok((ControlServer { server, commands, open: Vec::new() }, queues))
     }
 
     /// Descriptors that become readable when [`serve`](Self::serve) has something to do.
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [shm::descriptor(self.server.requests()), self.orders.event.as_fd()]
+        [shm::descriptor(self.server.requests()), self.commands.event.as_fd()]
     }
 
     /// Replies to the requests that links have handled, and queues new ones.
     pub(crate) fn serve(&mut self) {
-        self.orders.event.clear();
-        while let Some((number, outcome)) = self.orders.outcome() {
+        self.commands.event.clear();
+        while let Some((number, outcome)) = self.commands.outcome() {
             if let Some(at) = self.open.iter().position(|(open, _)| *open == number) {
                 let (_, asked) = self.open.swap_remove(at);
                 self.answer(asked, outcome);
@@ -165,7 +167,7 @@ impl ControlServer {
             match self.server.receive() {
                 Ok(Some(asked)) => {
                     was_signaled = false;
-                    self.hand_on(asked);
+                    self.forward(asked);
                 }
                 Ok(None) => break,
                 Err(failure) => return tracing::warn!(%failure, "a request was not received"),
@@ -177,7 +179,8 @@ impl ControlServer {
         }
     }
 
-    fn hand_on(&mut self, asked: Asked) {
+    /// Queues `asked`, or replies that it is refused.
+    fn forward(&mut self, asked: Asked) {
         match self.queue(&asked) {
             Ok(number) => self.open.push((number, asked)),
             Err(refusal) => self.answer(asked, Err(refusal)),
@@ -192,7 +195,7 @@ impl ControlServer {
             let hint = "client and hub are of different versions";
             Failure::new(Kind::Failed, "the request is not known to this hub", hint)
         })?;
-        self.orders.ask(&sensor, verb, model.unwrap_or_default())
+        self.commands.ask(&sensor, verb, model.unwrap_or_default())
     }
 
     fn answer(&self, asked: Asked, outcome: Outcome) {
@@ -209,18 +212,18 @@ pub struct ControlQueue {
     /// Whether a user has paused the sensor.
     paused: bool,
     queue: Receiver<QueuedRequest>,
-    changed: Changed,
+    changed: PendingSettings,
     event: Arc<EventFd>,
     outcomes: Sender<(u64, Outcome)>,
     server: Arc<EventFd>,
 }
 
 /// The source of a link's data. A user can pause, resume or restart it.
-pub(crate) enum Flow<'a> {
+pub(crate) enum PauseTarget<'a> {
     /// A session with a sensor.
     Session(&'a mut PortSession),
     /// The port is missing.
-    Away,
+    NoPort,
     /// The player of a recording.
     Recording(&'a Player),
 }
@@ -231,7 +234,7 @@ impl ControlQueue {
         self.paused
     }
 
-    /// Applies `control` to `flow` at `now`.
+    /// Applies `control` to `target` at `now`.
     ///
     /// # Errors
     ///
@@ -239,11 +242,11 @@ impl ControlQueue {
     pub(crate) fn control(
         &mut self,
         control: Control,
-        flow: &mut Flow<'_>,
+        target: &mut PauseTarget<'_>,
         now: Nanos,
     ) -> Result<(), Failure> {
-        match flow {
-            Flow::Recording(player) => {
+        match target {
+            PauseTarget::Recording(player) => {
                 match control {
                     Control::Pause => player.pause(),
                     Control::Resume => player.resume(),
@@ -251,9 +254,9 @@ impl ControlQueue {
                 }
                 return Ok(());
             }
-            Flow::Away if control == Control::Resync => return Err(self.refusal("the port is away")),
-            Flow::Away => {}
-            Flow::Session(session) => session.control(control, now),
+            PauseTarget::NoPort if control == Control::Resync => return Err(self.refusal("the port is away")),
+            PauseTarget::NoPort => {}
+            PauseTarget::Session(session) => session.control(control, now),
         }
         self.paused = control == Control::Pause;
         Ok(())
@@ -295,4 +298,4 @@ impl AsFd for ControlQueue {
 /// Descriptors of a connection to a client: both directions, and the memory of its requests.
 const CLIENT_DESCRIPTORS: u64 = 4;
 /// Maximum number of waiting requests for each link. Further requests are refused.
-const QUEUE: usize = 4;
+const QUEUE_CAPACITY: usize = 4;

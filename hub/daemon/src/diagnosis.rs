@@ -1,6 +1,10 @@
-//! Finds the problem of a link that its status reports: the session's problem, a unit other than the configured one,
-//! more bytes than the line can carry, a line that damages most bytes, bytes of another scanner, settings that
-//! another process changed, a scanner that restarts, and subscribers that receive nothing.
+//! Finds the problem of a link that its status reports:
+//!
+//! - the problem of the session, or a unit other than the configured one
+//! - more bytes than the line can carry, or a line that damages most bytes
+//! - bytes of another scanner, or a scanner that restarts
+//! - settings of the port that another process changed
+//! - subscribers that receive nothing
 //!
 //! Every change of the message is a log line. Numbers in a message are therefore rounded, and stay while they vary a
 //! little.
@@ -51,7 +55,7 @@ pub(crate) struct Diagnosis<'a> {
     starved: usize,
     /// Consecutive statuses with such subscribers.
     starved_statuses: u32,
-    /// Measuring mode of which the log says whether it has marks.
+    /// Measuring mode that was last checked for marks.
     logged_mode: u8,
 }
 

@@ -1,5 +1,10 @@
-//! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
-//! memory; who listens is not its business.
+//! The hub: it runs the links to scanners, with one thread for each, and publishes their samples in shared memory.
+//!
+//! - `supervise.rs` starts and ends the hub. `process.rs`, `service.rs` and `system.rs` are its border to the operating
+//!   system; `control.rs` receives requests of users, and `reload.rs` applies a new configuration.
+//! - A live link reads top to bottom in `reconnect.rs`, `session_driver.rs`, `link.rs`, `link_output.rs` and
+//!   `pipeline.rs`. `platform.rs` is the border below which a simulation replaces this machine.
+//! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording.
 
 mod control;
 mod diagnosis;
@@ -23,11 +28,11 @@ mod supervise;
 mod system;
 mod topics;
 
-pub use control::{ControlQueue, Orders, Outcome};
+pub use control::{CommandSender, ControlQueue, Outcome};
 pub use player::{PlaybackOptions, PlaybackRate, Player, Progress};
 pub use process::explain_bus_error;
 pub use reconnect::LiveLink;
-pub use reload::{Read, Reload};
+pub use reload::{ConfigLoader, Reload};
 pub use replay::{RecordedAngle, RecordedMount};
 pub use replay_hub::{Replay, replay};
 pub use saved_state::{KnownRate, KnownScanner, SaveQueue, SaveSlot, StateSaver, StateStore};

@@ -6,7 +6,7 @@ use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
 use scanhub_drivers::{PortSession, Trouble};
 use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
-use crate::control::{ControlQueue, Flow};
+use crate::control::{ControlQueue, PauseTarget};
 use crate::diagnosis::Diagnosis;
 use crate::link_output::{LinkOutput, Published, RecordedMetadata};
 use crate::link_stats::LinkStats;
@@ -207,7 +207,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     }
 
     /// Handles the requests of users, and applies changed settings.
-    pub(crate) fn handle_requests(&mut self, mut flow: Flow<'_>) {
+    pub(crate) fn handle_requests(&mut self, mut target: PauseTarget<'_>) {
         if let Some(processing) = self.control.changed() {
             self.change(&processing);
         }
@@ -220,7 +220,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
                 Verb::Show | Verb::Reset | Verb::Freeze | Verb::Thaw | Verb::Load => None,
             };
             let outcome = match control {
-                Some(control) => self.control.control(control, &mut flow, now).map(|()| None),
+                Some(control) => self.control.control(control, &mut target, now).map(|()| None),
                 None => {
                     let shown = self.output.handle(request.verb, &request.model);
                     let kept_wall_ns = self.platform.saved_state().and_then(SavedState::kept_wall_ns);

@@ -1,5 +1,5 @@
-//! The player of a recording. The threads of its links ask when their next telegram is due, and keys and requests of
-//! users pause, step and speed it up. At maximum rate no link asks, and nothing is locked.
+//! The player of a recording. The threads of its links query when their next telegram is due, and keys and requests
+//! of users pause, step and speed it up. At maximum rate, links play without a query, and nothing is locked.
 //!
 //! [`Playback`] is the clock of the player. It keeps the times between telegrams of all links while the recording is
 //! paused, stepped, played faster or slower, and repeated. The current time is an argument.
@@ -56,7 +56,7 @@ pub struct Player {
 
 /// Progress of one link.
 struct LinkProgress {
-    /// Readable when the link must ask again.
+    /// Readable when the link must call [`PlayerHandle::next_action`] again.
     event: EventFd,
     /// Media time of the last telegram.
     media: AtomicU64,
@@ -275,7 +275,7 @@ impl Player {
         self.notify(playback);
     }
 
-    /// Unlocks `playback`, and wakes the links that must ask again, and the supervisor at the end.
+    /// Unlocks `playback`, and wakes the links whose next action may have changed, and the supervisor at the end.
     fn notify(&self, mut playback: MutexGuard<'_, Playback>) {
         self.is_unthrottled.store(playback.is_unthrottled(), Ordering::Relaxed);
         let (has_changed, is_over) = (playback.take_change(), playback.is_over());
@@ -301,17 +301,17 @@ impl Player {
 }
 
 impl PlayerHandle<'_> {
-    /// Returns whether the link may play everything without asking.
+    /// Returns whether the link may play everything without a query.
     pub(crate) fn is_unthrottled(self) -> bool {
         self.player.is_unthrottled.load(Ordering::Relaxed)
     }
 
-    /// Returns what the link does, whose next telegram has time `media`.
+    /// Returns the next action of the link, whose next telegram has time `media`.
     pub(crate) fn next_action(self, media: Nanos, now: Nanos) -> PlaybackAction {
         self.ask(|playback| playback.next_action(self.number, media, now))
     }
 
-    /// Handles that the link is at the end of lap number `lap`. Returns what the link does next.
+    /// Handles that the link is at the end of lap number `lap`. Returns the next action of the link.
     pub(crate) fn end(self, lap: u32, now: Nanos) -> PlaybackAction {
         let progress = self.progress();
         progress.has_ended.store(true, Ordering::Relaxed);
@@ -346,7 +346,7 @@ impl PlayerHandle<'_> {
         self.player.lock().play().is_paused
     }
 
-    /// Returns the event that is readable when the link must ask again.
+    /// Returns the event that is readable when the next action of the link may have changed.
     pub(crate) fn event(&self) -> &EventFd {
         &self.progress().event
     }
@@ -363,7 +363,7 @@ impl PlayerHandle<'_> {
     }
 }
 
-/// What a link does next.
+/// Next action of a link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum PlaybackAction {
     /// Plays its next telegram now.
@@ -407,7 +407,7 @@ struct Playback {
     links: Vec<Next>,
     /// Number of restarts.
     lap: u32,
-    /// Whether this lap had a telegram, including those of links that did not ask.
+    /// Whether this lap had a telegram, including those of links that played without a query.
     has_played: bool,
     /// Start of the first lap, and the end of the last one.
     began_at: Option<Nanos>,
@@ -417,7 +417,7 @@ struct Playback {
     paused: Nanos,
     /// Whether the next telegram must be played, once all links have reported theirs.
     is_step_pending: bool,
-    /// Whether waiting links must ask again.
+    /// Whether the next actions of waiting links may have changed.
     has_changed: bool,
     /// End of the last silence that was skipped in this lap, as media time; 0 if there was none. Angles before it are not played.
     skipped_until: Nanos,
@@ -458,7 +458,7 @@ impl Playback {
         self.start(now);
     }
 
-    /// Returns what `link` does, whose next telegram has time `media`.
+    /// Returns the next action of `link`, whose next telegram has time `media`.
     fn next_action(&mut self, link: usize, media: Nanos, now: Nanos) -> PlaybackAction {
         self.links[link] = Next::At(media);
         self.start(now);
@@ -497,7 +497,7 @@ impl Playback {
         }
     }
 
-    /// Handles the end of lap number `lap` for `link`. Returns what the link does next.
+    /// Handles the end of lap number `lap` for `link`. Returns the next action of the link.
     fn end(&mut self, link: usize, lap: u32, now: Nanos) -> PlaybackAction {
         if self.lap != lap {
             return PlaybackAction::Restart(self.lap);
@@ -582,7 +582,7 @@ impl Playback {
         self.paused_at = self.began_at.filter(|_| is_paused).map(|_| now);
     }
 
-    /// Returns whether waiting links must ask again since the last call.
+    /// Returns whether the next actions of waiting links may have changed since the last call.
     fn take_change(&mut self) -> bool {
         std::mem::take(&mut self.has_changed)
     }
@@ -599,7 +599,7 @@ impl Playback {
         }
     }
 
-    /// Lets `link` play. Its next telegram is unknown until it asks again.
+    /// Lets `link` play. Its next telegram is unknown until it reports it.
     fn play_now(&mut self, link: usize, due: Due) -> PlaybackAction {
         self.has_played = true;
         self.links[link] = Next::Unknown;
@@ -803,7 +803,7 @@ mod tests {
         playback.step(101 * SECOND, 0);
         assert_eq!(playback.next_action(1, 3 * SECOND, 101 * SECOND), PlaybackAction::Wait);
         assert!(is_now(playback.next_action(0, 2 * SECOND, 102 * SECOND), 102 * SECOND));
-        // At maximum rate no link asks.
+        // At maximum rate, links play without a query.
         playback.set_rate(PlaybackRate::Max, 103 * SECOND, 0);
         playback.pause(false, 103 * SECOND, 0);
         assert!(is_now(playback.next_action(0, 4 * SECOND, 103 * SECOND), 103 * SECOND));

@@ -9,7 +9,7 @@ use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
 use schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
-use crate::control::{ControlQueue, Flow};
+use crate::control::{ControlQueue, PauseTarget};
 use crate::link::LinkCore;
 use crate::platform::{Line, Platform, Wait, WaitSource, WakeReason};
 use crate::session_driver::{OpenLine, SessionDriver};
@@ -315,7 +315,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         let core = &mut self.core;
         let (Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. }) = &self.phase else { return };
         if woken == WakeReason::Request {
-            core.handle_requests(Flow::Away);
+            core.handle_requests(PauseTarget::NoPort);
         } else {
             core.show(None, State::Absent, &reason.message);
         }

@@ -1,44 +1,44 @@
-//! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of
-//! the stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be
+//! Reload of the configuration while the hub runs. Settings of the processors change with the next scan, and no scan
+//! is lost. Settings of a line wait for the next start of the hub, which the log says. An invalid configuration
 //! changes nothing.
 
 use config::{Background, Config, Link, Processing};
 use schema::{Failure, Nanos};
 
-use crate::control::Orders;
+use crate::control::CommandSender;
 use crate::service::Service;
 
-/// How the configuration is read.
-pub type Read<'a> = &'a dyn Fn() -> Result<Config, Failure>;
+/// Function that reads the configuration.
+pub type ConfigLoader<'a> = &'a dyn Fn() -> Result<Config, Failure>;
 
-/// What the hub works with, and where it looks whether that is still so.
+/// Running configuration of the hub, and the loader of the new one.
 pub struct Reload<'a> {
     running: Config,
-    read: Read<'a>,
+    read: ConfigLoader<'a>,
     service: &'a Service,
 }
 
-/// What another configuration means to a hub that runs.
+/// Changes of the configuration, sorted by when they apply.
 #[derive(Debug, Default, PartialEq)]
 struct Differences {
-    /// What its links make of their scans from now on, and which sections of it are others.
+    /// Settings that apply with the next scan: name of the link, its new settings, and the sections that have changed.
     now: Vec<(String, Processing, Vec<&'static str>)>,
-    /// What has to wait for the next start, by the link's name.
+    /// Keys that wait for the next start, by the name of the link.
     later: Vec<(String, Vec<&'static str>)>,
 }
 
 impl<'a> Reload<'a> {
-    /// For a hub that runs with `running`.
-    pub fn new(running: &Config, read: Read<'a>, service: &'a Service) -> Reload<'a> {
+    /// Creates the reload of a hub that runs with `running`.
+    pub fn new(running: &Config, read: ConfigLoader<'a>, service: &'a Service) -> Reload<'a> {
         Reload { running: running.clone(), read, service }
     }
 
-    /// Reads the configuration at `now`, tells the links by `orders` what concerns them, and the log what came of it.
-    pub fn reload(&mut self, orders: &Orders, now: Nanos) {
+    /// Reads the configuration at `now`, sends the links their new settings by `commands`, and logs the result.
+    pub fn reload(&mut self, commands: &CommandSender, now: Nanos) {
         self.service.reloading(now);
         let refused = match (self.read)() {
             Ok(read) => {
-                self.take(read, orders);
+                self.take(read, commands);
                 None
             }
             Err(failure) => {
@@ -54,14 +54,14 @@ impl<'a> Reload<'a> {
         self.service.ready(&sensors, refused.as_deref());
     }
 
-    fn take(&mut self, read: Config, orders: &Orders) {
+    fn take(&mut self, read: Config, commands: &CommandSender) {
         let Differences { now, later } = Differences::between(&self.running, &read);
         if now.is_empty() && later.is_empty() {
             tracing::info!("the configuration has not changed");
         }
         for (name, processing, sections) in now {
             tracing::info!("{name}: {} changed as configured", sections.join(", "));
-            orders.change(&name, &processing);
+            commands.change(&name, &processing);
             if let Some(link) = self.running.links.iter_mut().find(|link| link.name == name) {
                 link.processing = processing;
             }
@@ -105,15 +105,15 @@ impl Differences {
     }
 
     fn of_link(&mut self, old: &Link, new: &Link) {
-        let taken = taken(&old.processing, &new.processing);
+        let taken = merged(&old.processing, &new.processing);
         let sections = old.processing.differences(&taken);
-        let begin = |link: &Link| {
+        let start = |link: &Link| {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
-        let is_begun = old.processing.background.is_kept && new.processing.background.is_kept;
+        let has_started = old.processing.background.is_kept && new.processing.background.is_kept;
         let mut waiting = old.differences(new);
-        if is_begun && begin(old) != begin(new) {
+        if has_started && start(old) != start(new) {
             waiting.push("background.start");
         }
         if !sections.is_empty() {
@@ -125,8 +125,9 @@ impl Differences {
     }
 }
 
-/// What a link that works by `old` takes over of `new`: all but what its background began with.
-fn taken(old: &Processing, new: &Processing) -> Processing {
+/// Returns the settings that a link with `old` settings takes over from `new` ones: all but the start of its
+/// background.
+fn merged(old: &Processing, new: &Processing) -> Processing {
     let mut taken = new.clone();
     if old.background.is_kept {
         let Background { learning, file, model, start_is_said, .. } = &old.background;
@@ -150,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn which_scanner_it_is_changes_at_the_next_start() {
+    fn scanner_changes_at_the_next_start() {
         let of = |set: &[&str]| config(&["a=/dev/x"], set);
         let (lms, auto) = (of(&[]), of(&["link.a.family=ld"]));
         let named = of(&["link.a.family=ld", "link.a.model=ld19", "link.a.beams=300"]);
@@ -164,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_made_of_scans_changes_now_and_lines_at_the_next_start() {
+    fn processing_changes_now_and_lines_at_the_next_start() {
         let old = config(&["a=/dev/x", "b=/dev/y,family=lms", "c=/dev/z"], &[]);
         let same = Differences::between(&old, &old);
         assert_eq!(same, Differences::default());
@@ -210,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn a_background_that_has_begun_began_as_it_did() {
+    fn started_background_keeps_its_start() {
         let of = |set: &[&str]| config(&["a=/dev/x"], set);
         let begun = of(&["background.start=first-scan"]);
         let other = of(&["background.threshold_mm=50"]);
@@ -222,7 +223,7 @@ mod tests {
             (sections.join(" "), later),
             ("background".to_owned(), vec![("a".to_owned(), vec!["background.start"])])
         );
-        // One that has not begun begins as it is said now.
+        // A background that has not started takes the new start.
         let off = of(&["background.method=off", "background.start=first-scan"]);
         let Differences { now, later } = Differences::between(&off, &of(&[]));
         assert_eq!((now[0].1.background.learning.start, later), (Start::Empty, Vec::new()));

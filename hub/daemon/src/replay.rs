@@ -22,14 +22,14 @@ use scanhub_drivers::line::{Event, Output, Protocol as _};
 use scanhub_drivers::{PortSession, Settings};
 use schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 
-use crate::control::Flow;
+use crate::control::PauseTarget;
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
 use crate::platform::WakeReason;
 use crate::player::{Due, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
 use crate::system::System;
 
-pub(crate) use recorded::{Origin, Recorded, tell_of_damage};
+pub(crate) use recorded::{Origin, Recorded, log_damage};
 use recorded::{Stream, Timeline, read};
 
 /// Part of a recording that a link plays together with other links.
@@ -85,7 +85,7 @@ struct ReplayLink<'a, 'p> {
     handle: PlayerHandle<'p>,
     /// Message about a problem of the recording; otherwise empty.
     problem: String,
-    /// Time of the next check for requests while nothing is waited for.
+    /// Time of the next check for requests while the link plays without a wait.
     check_at: Nanos,
 }
 
@@ -253,7 +253,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     fn rest(&mut self, until: Nanos) -> WakeReason {
         let event = self.handle.event();
         match self.link.wait(event.as_fd(), until) {
-            WakeReason::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
+            WakeReason::Request => self.link.handle_requests(PauseTarget::Recording(self.handle.player)),
             WakeReason::Ready => event.clear(),
             WakeReason::Stop => return WakeReason::Stop,
             WakeReason::Timeout => {}
@@ -359,7 +359,7 @@ const IDLE_INTERVAL: Nanos = 100 * MILLIS;
 const FIRST_SUBSCRIBER_TIMEOUT: Nanos = 1_000 * MILLIS;
 /// Time that a subscriber to the first topic has for the others.
 const OTHER_TOPICS_TIME: Nanos = 100 * MILLIS;
-/// Interval of the checks for requests and the end of the hub while nothing is waited for.
+/// Interval of the checks for requests and the end of the hub while a link plays without a wait.
 const POLL_INTERVAL: Nanos = 5 * MILLIS;
 /// Maximum number of bytes given to the session at a time: less than a telegram, so that stamps stay accurate.
 const CHUNK_LEN: usize = 128;

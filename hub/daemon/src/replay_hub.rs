@@ -1,5 +1,4 @@
-//! A hub whose links are a recording: which sensors are in it, what is configured for them, and one player for all.
-//! Refuses to know threads and topics.
+//! A hub that plays a recording: finds the sensors in it and their configuration, and creates one player for all links.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,10 +11,10 @@ use schema::{Failure, Family, Kind, Nanos, check_sensor};
 use shm::Domain;
 
 use crate::player::{PlaybackOptions, Player, Progress};
-use crate::replay::{Origin, Recorded, RecordedMount, tell_of_damage};
+use crate::replay::{Origin, Recorded, RecordedMount, log_damage};
 use crate::supervise::{self, Ready, ReplaySet};
 
-/// What is to be replayed, and how.
+/// Options of a replay.
 #[derive(Clone, Debug)]
 pub struct Replay<'a> {
     /// The recording.
@@ -24,21 +23,23 @@ pub struct Replay<'a> {
     pub sensor: Option<&'a str>,
     /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
-    /// Where its sensors are configured.
+    /// Configuration of its sensors.
     pub sources: &'a Sources,
-    /// What is asked of the player.
+    /// Options of the player.
     pub play: PlaybackOptions,
-    /// Whether the hub stays when everything was played.
+    /// Whether the hub continues after everything was played.
     pub holds: bool,
 }
 
-/// Runs a hub in `domain` whose links are a recording, until everything was played and whoever listens had time to read
-/// it, or SIGINT or SIGTERM; `on_ready` is called once, when all topics exist, before the first telegram. How far it
-/// came.
+/// Runs a hub in `domain` that plays a recording, until everything was played and the subscribers had time to read it,
+/// or until SIGINT or SIGTERM. `on_ready` is called once, when all topics exist, before the first telegram. Returns
+/// the progress at the end.
 ///
-/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if it
-/// ends before it shall start, [`Kind::Configuration`] if it and the configuration do not go together, and whatever
-/// [`run`](crate::run) fails with.
+/// # Errors
+///
+/// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor,
+/// [`Kind::Usage`] if it ends before the requested start, and [`Kind::Configuration`] if it contradicts the
+/// configuration. Also returns the errors of [`run`](crate::run).
 pub fn replay(
     replay: &Replay<'_>,
     domain: &Domain,
@@ -46,7 +47,7 @@ pub fn replay(
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open_as(file, replay.family)?;
-    tell_of_damage(&recording);
+    log_damage(&recording);
     let sensors = sensors(&recording, replay.sensor)?;
     let read = || configuration(sources, &sensors, file);
     let config = read()?;
@@ -71,14 +72,14 @@ pub fn replay(
     let length = parts.iter().filter_map(Recorded::length).max();
     let start_ns = replay.play.start_ns;
     if length.is_some_and(|length| start_ns > length) {
-        // By wall clocks, of which one may have been set: all of it is read to be sure.
+        // The length is by wall clocks, and one of them may have been set. Read the recording to be sure.
         let mut ends = Vec::with_capacity(links);
         for part in &parts {
             ends.push(part.end()?);
         }
         let end = ends.into_iter().max().unwrap_or(0);
         if start_ns > end {
-            return Err(behind_the_end(file, start_ns, end));
+            return Err(start_after_end(file, start_ns, end));
         }
     }
     let player = Arc::new(Player::new(replay.play, links, length)?.with_mounts(mounts));
@@ -87,30 +88,30 @@ pub fn replay(
     Ok(player.progress())
 }
 
-fn behind_the_end(file: &Path, start_ns: Nanos, end_ns: Nanos) -> Failure {
+fn start_after_end(file: &Path, start_ns: Nanos, end_ns: Nanos) -> Failure {
     let [start_s, end_s] = [start_ns, end_ns].map(|ns| ns as f64 / 1e9);
     let message =
         format!("--start {start_s} s is after the end of {}, which lasts {end_s:.3} s", file.display());
     Failure::new(Kind::Usage, message, "it counts from the first telegram")
 }
 
-/// A sensor that is played.
+/// Sensor that is played.
 struct Sensor {
-    /// Its name in the recording, where that has names.
+    /// Name in the recording, if that has names.
     recorded: Option<String>,
-    /// Its link's.
+    /// Name of its link.
     link: String,
     /// Family of its scanner; `None` if this version does not have it.
     family: Option<Family>,
-    /// Where its head turns: the model, and the beams that were recorded, as far as they are known.
+    /// Model and number of beams of a rotating scanner, as far as the recording has them.
     model: Result<Option<Model>, Failure>,
     beams: Option<usize>,
-    /// The way in which it measures.
+    /// Name of the measuring mode.
     way: Option<&'static str>,
 }
 
 impl Sensor {
-    /// The sensor of `recording`, which has no other one, for `link`.
+    /// Creates the only sensor of `recording`, which `link` plays.
     fn new(recorded: Option<String>, link: String, recording: &Recording) -> Sensor {
         let (model, beams, way) = (recording.model(), recording.beams(), recording.contents().way);
         Sensor { recorded, link, family: recording.family(), model, beams, way }
@@ -170,15 +171,15 @@ fn mounts(
     Ok(mounts)
 }
 
-/// What a link can be called: the name of a sensor of another machine has a dot.
+/// Returns a name for the link of `sensor`. The name of a remote sensor has a dot, which a link cannot have.
 fn link_name(sensor: &str) -> String {
     let name: String = sensor.chars().map(|c| if c == '.' { '-' } else { c }).collect();
-    // Of a machine without a name the number is long, and the sensor's name is what tells.
-    let excess = name.len().saturating_sub(LONGEST_NAME);
+    // Drop the start of a long name: a machine without a name has a long ID there, and the sensor's name is the end.
+    let excess = name.len().saturating_sub(MAX_NAME_LEN);
     name.get(excess..).unwrap_or(&name).to_owned()
 }
 
-/// What is configured, with the sensors of the recording for links.
+/// Returns the configuration, with the sensors of the recording as links.
 fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<Config, Failure> {
     let (sources, searched) = with_links(sources, sensors)?;
     let mut config = Config::load(&sources)?;
@@ -187,7 +188,7 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
         link.port = Source::File { path: file.to_owned(), paced: true };
         link.scanner.settings.is_found = searched.contains(&link.name);
         let of = sensors.iter().find(|sensor| sensor.link == link.name);
-        // What is not configured is as it was recorded.
+        // The recording supplies the settings that are not configured.
         if let Some(Sensor { model, beams, way, .. }) = of.filter(|_| link.scanner.is_auto()) {
             let settings = &mut link.scanner.settings;
             if settings.mode.is_none() {
@@ -204,7 +205,7 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
 /// have that of their sensor.
 fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<String>), Failure> {
     let mut sources = sources.clone();
-    // Not the path itself, which may have signs that have a meaning in a port's name.
+    // Not the path itself, which may contain characters with a meaning in the name of a port.
     for sensor in sensors {
         let name = format!("{}=", sensor.link);
         if !sources.links.iter().any(|link| link.starts_with(&name)) {
@@ -220,7 +221,7 @@ fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<Str
     Ok((sources, searched.iter().map(|sensor| sensor.link.clone()).collect()))
 }
 
-/// Links that are configured and not in `config`.
+/// Returns the configured links that are not in `config`.
 fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Vec<String>, Failure> {
     if sources.files.is_empty() {
         return Ok(Vec::new());
@@ -229,10 +230,10 @@ fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Ve
     Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
 }
 
-/// The name of the sensor of a recording that names none.
+/// Name of a sensor that has none in the recording.
 const UNNAMED: &str = "front";
-/// Signs of a sensor's name.
-const LONGEST_NAME: usize = 24;
+/// Maximum length of a sensor's name in bytes.
+const MAX_NAME_LEN: usize = 24;
 
 #[cfg(test)]
 mod tests {
@@ -250,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn links_are_those_of_the_recording_as_they_are_configured() {
+    fn sensors_of_the_recording_become_links_as_configured() {
         let sources = Sources { set: vec!["link.front.angle=100".into()], ..Sources::default() };
         let file = Path::new("/tmp/a?b=c.mcap");
         let config = configuration(&sources, &[sensor("front"), sensor("left")], file).unwrap();
@@ -270,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn sensors_of_other_machines_get_names_that_links_can_have() {
+    fn remote_sensors_get_valid_link_names() {
         assert_eq!(link_name("robot1.front"), "robot1-front");
         let long = link_name("5f3a12bc00d1e2f3.front_left");
         assert_eq!((long.len(), long.ends_with("-front_left")), (24, true), "{long}");

@@ -1,5 +1,5 @@
 //! State of the links that outlives the hub: the background of each sensor, the rate at which its scanner was found,
-//! and the scanner that a search found. Without a background, whoever stands in front of a sensor while the hub
+//! and the scanner that a search found. Without a background, a person who stands in front of a sensor while the hub
 //! starts becomes part of the background, and foreground is unknown for seconds.
 //!
 //! A link hands state over between two scans, by a [`SaveSlot`], and never waits for a disk. [`StateSaver`] decides

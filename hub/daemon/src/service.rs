@@ -1,6 +1,6 @@
-//! The service manager that started the hub, if one did: told that the hub is up, and that its links work; given the
-//! ports to keep, so that what a sensor sends while a killed hub is replaced waits in the line's buffer. Refuses to know
-//! what a port is, and which service manager it is (systemd's protocol, sd_notify(3)).
+//! Protocol of the service manager that started the hub, if one did: sd_notify(3), as systemd has it. The hub reports
+//! that it is ready and that its links work. It also passes its open ports to the service manager, so that bytes of a
+//! scanner wait in the buffer of the line while a killed hub is replaced.
 
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,17 +10,18 @@ use rustix::io::{FdFlags, fcntl_setfd};
 use schema::Nanos;
 use sd_notify::NotifyState;
 
-/// The service manager; without one, as by default, nothing of this does anything.
+/// The service manager. Without one, as by default, all functions have no effect.
 #[derive(Default)]
 pub struct Service {
-    /// What the one before this hub gave it to keep, by name.
+    /// Ports that the previous hub passed to it, with the name of the link.
     kept: Mutex<Vec<(String, OwnedFd)>>,
-    /// So often it wants to hear that the hub works.
+    /// Interval at which it expects a report that the hub works.
     watchdog: Option<Nanos>,
 }
 
 impl Service {
-    /// That of this process, as its environment tells. To be called once, before anything else is opened.
+    /// Creates the service manager of this process from its environment. Must be called once, before anything else is
+    /// opened.
     pub(crate) fn of_process() -> Service {
         let passed = sd_listen_fds::get().unwrap_or_else(|error| {
             tracing::warn!(%error, "ports that the service manager kept cannot be taken over");
@@ -34,8 +35,8 @@ impl Service {
         Service { kept: Mutex::new(named.filter_map(own).collect()), watchdog }
     }
 
-    /// Puts what was kept under the name of the link that it is of now, whoever had it before; what is of none is not kept
-    /// any longer. To be called before anything is kept again: names are forgotten with all that is kept under them.
+    /// Assigns each kept port to the link that has it now, according to `owner`. A port without a link is not kept any
+    /// longer. Must be called before a port is kept again, because forgetting a name forgets all ports with it.
     pub(crate) fn assign(&self, owner: impl Fn(&OwnedFd) -> Option<String>) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, line) in std::mem::take(&mut *kept) {
@@ -47,63 +48,64 @@ impl Service {
         }
     }
 
-    /// What was kept under `name`, once.
+    /// Takes a port that was kept under `name`.
     pub(crate) fn take(&self, name: &str) -> Option<OwnedFd> {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         let at = kept.iter().position(|(known, _)| known == name)?;
         Some(kept.swap_remove(at).1)
     }
 
-    /// Lets it keep `line` under `name` until it is forgotten, hangs up, or the service is stopped.
+    /// Keeps `line` under `name` until it is forgotten, hangs up, or the service is stopped.
     pub(crate) fn keep(&self, name: &str, line: impl AsFd) {
-        let said = [NotifyState::FdStore, NotifyState::FdName(name)];
-        told(sd_notify::notify_with_fds(&said, &[line.as_fd()]));
+        let messages = [NotifyState::FdStore, NotifyState::FdName(name)];
+        log_failure(sd_notify::notify_with_fds(&messages, &[line.as_fd()]));
     }
 
-    /// Lets it close what it keeps under `name`.
+    /// Closes the ports that are kept under `name`.
     pub(crate) fn forget(&self, name: &str) {
-        told(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
+        log_failure(sd_notify::notify(&[NotifyState::FdStoreRemove, NotifyState::FdName(name)]));
     }
 
-    /// The configuration is read again, as of `now`; [`ready`](Self::ready) follows in any case.
+    /// Reports that the hub reads its configuration again, as of `now`. [`ready`](Self::ready) must follow in any case.
     pub(crate) fn reloading(&self, now: Nanos) {
         let micros = NotifyState::MonotonicUsec(i128::from(now / 1_000));
-        told(sd_notify::notify(&[NotifyState::Reloading, micros]));
+        log_failure(sd_notify::notify(&[NotifyState::Reloading, micros]));
     }
 
-    /// The hub is up with `sensors`, at its start or with a configuration that it read again; or that was `refused`, and it is
-    /// as it was.
+    /// Reports that the hub is ready with `sensors`, at its start or after a reload. If the new configuration was
+    /// `refused`, the old one stays.
     pub(crate) fn ready(&self, sensors: &[String], refused: Option<&str>) {
         let refused = refused.map(|why| format!("; configuration refused: {why}")).unwrap_or_default();
         let status = format!("sensors: {}{refused}", sensors.join(", "));
-        told(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));
+        log_failure(sd_notify::notify(&[NotifyState::Ready, NotifyState::Status(&status)]));
     }
 
-    /// The hub ends because it was told to.
+    /// Reports that the hub ends as requested.
     pub(crate) fn stopping(&self) {
-        told(sd_notify::notify(&[NotifyState::Stopping]));
+        log_failure(sd_notify::notify(&[NotifyState::Stopping]));
     }
 }
 
-/// Tells the service manager that the hub works as long as all its links do: each of them finished something since that
-/// was last told. A timer would tell only that there is time.
+/// Reports to the service manager that the hub works, if every link has finished something since the last report. A
+/// timer alone would not prove that.
 pub(crate) struct Watchdog<'a> {
     worked: &'a [AtomicBool],
-    every: Nanos,
+    interval: Nanos,
     next: Nanos,
 }
 
 impl<'a> Watchdog<'a> {
-    /// One over the links that set `worked`; nothing if the service manager does not want to know.
+    /// Creates the watchdog of the links that set `worked`; `None` if the service manager expects no reports.
     pub(crate) fn new(service: &Service, worked: &'a [AtomicBool], now: Nanos) -> Option<Watchdog<'a>> {
-        let every = service.watchdog? / TOLD_EARLIER;
-        Some(Watchdog { worked, every, next: now + every })
+        let interval = service.watchdog? / REPORTS_PER_INTERVAL;
+        Some(Watchdog { worked, interval, next: now + interval })
     }
 
-    /// Tells it, if it is time and all worked. To be called more often than the service manager wants to hear.
-    pub(crate) fn look(&mut self, now: Nanos) {
+    /// Sends a report if one is due and all links have worked. Must be called more often than the service manager
+    /// expects reports.
+    pub(crate) fn notify_due(&mut self, now: Nanos) {
         if self.is_due(now) {
-            told(sd_notify::notify(&[NotifyState::Watchdog]));
+            log_failure(sd_notify::notify(&[NotifyState::Watchdog]));
         }
     }
 
@@ -111,28 +113,28 @@ impl<'a> Watchdog<'a> {
         let is_due = now >= self.next && self.worked.iter().all(|worked| worked.load(Ordering::Relaxed));
         if is_due {
             self.worked.iter().for_each(|worked| worked.store(false, Ordering::Relaxed));
-            self.next = now + self.every;
+            self.next = now + self.interval;
         }
         is_due
     }
 }
 
-/// That it cannot be told is no reason to stop: it will see for itself.
-fn told(outcome: std::io::Result<()>) {
+/// Logs a failed report. The hub continues, because the service manager handles missing reports itself.
+fn log_failure(outcome: std::io::Result<()>) {
     if let Err(error) = outcome {
         tracing::debug!(%error, "the service manager cannot be notified");
     }
 }
 
-/// It hears so many times as often as it wants to: a link that waits for its next second is not late.
-const TOLD_EARLIER: Nanos = 4;
+/// Reports per expected one. A link that wakes up once a second is then not late.
+const REPORTS_PER_INTERVAL: Nanos = 4;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn only_when_all_links_worked_the_watchdog_is_fed() {
+    fn watchdog_reports_only_if_all_links_worked() {
         let service = Service { kept: Mutex::default(), watchdog: Some(40) };
         let worked = [AtomicBool::new(true), AtomicBool::new(false)];
         let mut watchdog = Watchdog::new(&service, &worked, 100).expect("one is wanted");
@@ -148,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_kept_is_taken_once() {
+    fn kept_port_is_taken_once() {
         let line = || OwnedFd::from(std::fs::File::open("/dev/null").unwrap());
         let kept = vec![("front".to_owned(), line()), ("rear".to_owned(), line())];
         let service = Service { kept: Mutex::new(kept), watchdog: None };
@@ -157,14 +159,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_kept_is_of_whose_port_it_is_now() {
+    fn kept_port_goes_to_the_link_that_has_it_now() {
         let line = |path| OwnedFd::from(std::fs::File::open(path).unwrap());
         let kept = [("front", "/dev/null"), ("rear", "/dev/zero"), ("side", "/dev/full")];
         let kept = kept.map(|(name, path)| (name.to_owned(), line(path)));
         let service = Service { kept: Mutex::new(kept.into()), watchdog: None };
         let device = |line: &OwnedFd| rustix::fs::fstat(line).unwrap().st_rdev;
         let [null, zero] = ["/dev/null", "/dev/zero"].map(|path| device(&line(path)));
-        // Two links have each other's port, the third one's is nobody's.
+        // Two links have swapped their ports, and the third port has no link.
         service.assign(|line| match device(line) {
             it if it == null => Some("rear".to_owned()),
             it if it == zero => Some("front".to_owned()),

@@ -20,7 +20,7 @@ use scanhub_drivers::search::{Memory, Search};
 use scanhub_drivers::{Model, PortSession};
 use schema::{MILLIS, Nanos, State, Status, line_time};
 
-use crate::control::Flow;
+use crate::control::PauseTarget;
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
 use crate::platform::{Line, Platform, SavedState, WaitSource, WakeReason};
@@ -166,7 +166,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         woken: WakeReason,
     ) -> io::Result<()> {
         if woken == WakeReason::Request {
-            core.handle_requests(Flow::Session(&mut open.session));
+            core.handle_requests(PauseTarget::Session(&mut open.session));
         } else {
             self.read(core, open)?;
         }

@@ -1,5 +1,5 @@
-//! The hub as a process: one per domain, one thread per link, an orderly end. It knows signals, threads and the
-//! domain's upkeep; bytes and topics are the links' business.
+//! The hub as a process: it takes the domain, starts a thread for each link, and then serves signals and requests
+//! until it ends all threads in order.
 
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::AtomicBool;
@@ -21,19 +21,19 @@ use crate::process::{
     SignalAction, Signals, check_descriptors, check_memory, no_resource, raise_descriptor_limit,
 };
 use crate::reconnect::LiveLink;
-use crate::reload::{Read, Reload};
+use crate::reload::{ConfigLoader, Reload};
 use crate::replay;
 use crate::replay::{Recorded, ReplayPart};
 use crate::saved_state::{StateSaver, StateWriter};
 use crate::service::{Service, Watchdog};
-use crate::system::{Hub, System};
+use crate::system::{LinkResources, System};
 
-/// What is up.
+/// Report that the hub is ready.
 #[derive(Clone, Debug)]
 pub struct Ready {
-    /// Number of this hub's life, random.
+    /// Random ID of this run of the hub.
     pub boot: u64,
-    /// The sensors' names.
+    /// Names of the sensors.
     pub sensors: Vec<String>,
     /// Names of the sensors that do not stream yet: their port cannot be opened, or another process publishes under
     /// their name.
@@ -45,9 +45,9 @@ pub struct Ready {
 /// The links of a hub that plays a recording.
 pub(crate) struct ReplaySet<'a> {
     pub(crate) player: &'a Player,
-    /// What each link plays.
+    /// Recording of each link.
     pub(crate) parts: Vec<Recorded>,
-    /// Whether the hub stays when everything was played.
+    /// Whether the hub continues after everything was played.
     pub(crate) holds: bool,
 }
 
@@ -69,29 +69,30 @@ struct EndOfPlayback<'a> {
 }
 
 impl EndOfPlayback<'_> {
-    /// Whether everything was played, and whoever listens had time to read it; or somebody does not want more.
+    /// Returns whether the hub ends at `now`: everything was played, and the subscribers had time to read it, or a
+    /// user has ended the player.
     fn has_ended(&mut self, now: Nanos) -> bool {
         self.player.over().clear();
         if self.player.is_ended() {
             return true;
         }
         if !self.holds && self.ends_at.is_none() && self.player.is_over() {
-            self.ends_at = Some(now + LINGER);
+            self.ends_at = Some(now + LINGER_TIME);
         }
         self.ends_at.is_some_and(|ends_at| now >= ends_at)
     }
 }
 
-/// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist. `read` tells the
-/// configuration: at the start, and at each SIGHUP, which changes what can be changed while links stream.
+/// Runs the hub in `domain` until SIGINT or SIGTERM. `on_ready` is called once, when all topics exist. `read` returns
+/// the configuration, at the start and at each SIGHUP, which applies the changes that are possible while links stream.
 ///
 /// # Errors
 ///
 /// Returns the error of `read` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
-/// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns [`Kind::Short`]
-/// if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and [`Kind::Failed`] if shared
-/// memory refuses. The hub waits for a port that cannot be opened for another reason, and for a name that another process
-/// has.
+/// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns
+/// [`Kind::Short`] if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and
+/// [`Kind::Failed`] if shared memory refuses. The hub waits for a port that cannot be opened for another reason, and
+/// for a name that another process has.
 pub fn run(
     read: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,
@@ -101,9 +102,10 @@ pub fn run(
     serve(read, config, None, domain, on_ready)
 }
 
-/// Runs a hub that begins with `config`; all links of it are of `set`, if there is one, with which it ends.
+/// Runs a hub that starts with `config`. If there is a `set`, all links play its recordings, and the hub ends with
+/// them.
 pub(crate) fn serve(
-    read: Read<'_>,
+    read: ConfigLoader<'_>,
     config: Config,
     set: Option<ReplaySet<'_>>,
     domain: &Domain,
@@ -123,7 +125,7 @@ pub(crate) fn serve(
     });
     check_descriptors(config.links.len())?;
     check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
-    // Ends after the links: it writes what they had learned last.
+    // Ends after the links, and writes their last state.
     let (config, saver) = begin(config, state)?;
     let writer = saver.map(StateWriter::start).transpose()?;
     let config = &config;
@@ -132,7 +134,7 @@ pub(crate) fn serve(
     let sensors = config.links.iter().map(|link| link.name.clone()).collect();
     let mut ready = Ready { boot: random(), sensors, waiting: Vec::new(), taken: Vec::new() };
     let boot = ready.boot;
-    // By the port, not by the name: a line that somebody keeps cannot be opened by anybody.
+    // By the port, not by the name: a line that the service manager keeps cannot be opened again.
     service.assign(|line| {
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
         owner.map(|link| link.name.clone())
@@ -150,7 +152,7 @@ pub(crate) fn serve(
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
         for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
-            let hub = Hub {
+            let resources = LinkResources {
                 node: &node,
                 limits: link.limits(&config.limits),
                 stop: &stop,
@@ -164,7 +166,7 @@ pub(crate) fn serve(
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || {
                 let report = |outcome| drop(report.send((number, outcome)));
-                let system = System::new(hub, &link.name, worked, save_slot);
+                let system = System::new(resources, &link.name, worked, save_slot);
                 run_link(link, number as u8, boot, &system, queue, part, report);
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
@@ -210,7 +212,8 @@ pub(crate) fn serve(
             let watchdog = Watchdog::new(&service, &worked, clock::now());
             let reload = Reload::new(config, read, &service);
             let end_of_playback = player.map(|player| EndOfPlayback { player, holds, ends_at: None });
-            outcome = keep_up(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive);
+            outcome =
+                run_supervisor(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive);
         }
         service.stopping();
         end_links(&stop);
@@ -220,7 +223,7 @@ pub(crate) fn serve(
     })
 }
 
-/// The configuration with what is kept for its links, and whoever keeps what they learn.
+/// Returns the configuration with the saved state of its links, and the saver of their new state.
 fn begin(
     config: Config,
     state: Option<StateDirectory>,
@@ -231,8 +234,8 @@ fn begin(
     }
 }
 
-/// Runs `link`, number `number` in the hub's life `boot`, until the hub ends, with a recording as `part` of several or alone.
-/// `report` is called once, when it is clear how the link starts.
+/// Runs `link`, number `number` in the run `boot` of the hub, until the hub ends. A recording is played as `part` of
+/// several, or alone. `report` is called once, with the outcome of the start.
 fn run_link(
     link: &Link,
     number: u8,
@@ -269,8 +272,8 @@ fn run_link(
     }
 }
 
-/// Looks after the links, what users ask of them and what dead consumers left, until a signal says to end.
-fn keep_up(
+/// Serves signals and requests, checks the links, and cleans up after dead processes, until the hub ends.
+fn run_supervisor(
     node: &Node,
     signals: &Signals,
     mut reload: Reload<'_>,
@@ -279,24 +282,24 @@ fn keep_up(
     mut end_of_playback: Option<EndOfPlayback<'_>>,
     is_alive: impl Fn() -> bool,
 ) -> Result<(), Failure> {
-    let mut upkeep_at = clock::now() + UPKEEP;
+    let mut cleanup_at = clock::now() + CLEANUP_INTERVAL;
     loop {
         let ([end, hangup], [requests, outcomes]) = (signals.descriptors(), control.descriptors());
-        // Nobody rings where nothing is played.
+        // Without a player, its place is taken by another descriptor.
         let over =
             end_of_playback.as_ref().map_or(end, |end_of_playback| end_of_playback.player.over().as_fd());
         let mut fds =
             [end, hangup, requests, outcomes, over].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
         let until = end_of_playback.as_ref().and_then(|end_of_playback| end_of_playback.ends_at);
-        let look = until.map_or(LOOK, |until| clock::span(clock::now(), until));
-        // A signal ends the wait, and is there to be taken.
-        let _ = poll(&mut fds, Some(&look));
+        let span = until.map_or(CHECK_INTERVAL, |until| clock::span(clock::now(), until));
+        // A signal ends the wait with an error, and is taken below.
+        let _ = poll(&mut fds, Some(&span));
         match signals.take() {
             Some(SignalAction::End) => return Ok(()),
-            Some(SignalAction::Reload) => reload.reload(&control.orders, clock::now()),
+            Some(SignalAction::Reload) => reload.reload(&control.commands, clock::now()),
             None => {}
         }
-        // Without a wake-up too: what is behind a request that could not be received has been announced already.
+        // Even without a wake-up: requests after one that could not be received were announced together with it.
         control.serve();
         if !is_alive() {
             return Err(broken_thread());
@@ -305,16 +308,16 @@ fn keep_up(
         if end_of_playback.as_mut().is_some_and(|end_of_playback| end_of_playback.has_ended(now)) {
             return Ok(());
         }
-        watchdog.iter_mut().for_each(|watchdog| watchdog.look(now));
-        if now >= upkeep_at {
+        watchdog.iter_mut().for_each(|watchdog| watchdog.notify_due(now));
+        if now >= cleanup_at {
             node.try_cleanup_dead_nodes();
-            upkeep_at = now + UPKEEP;
+            cleanup_at = now + CLEANUP_INTERVAL;
         }
     }
 }
 
 fn end_links(stop: &OwnedFd) {
-    // An eventfd that nobody reads takes one write for sure.
+    // An eventfd that no thread reads accepts one write.
     let _ = rustix::io::write(stop, &1u64.to_ne_bytes());
 }
 
@@ -331,9 +334,10 @@ fn random() -> u64 {
     RandomState::new().hash_one(std::process::id())
 }
 
-/// A hub that plays a recording stays for so long after its end.
-const LINGER: Nanos = 1_000 * MILLIS;
-/// Between two looks whether the links are alive.
-const LOOK: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
-/// Between two looks at what dead processes left: each reads the directory of all nodes, and nobody waits for it.
-const UPKEEP: Nanos = 5_000 * MILLIS;
+/// Time that subscribers have after the end of a recording.
+const LINGER_TIME: Nanos = 1_000 * MILLIS;
+/// Interval of the checks whether the links are alive.
+const CHECK_INTERVAL: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
+/// Interval between cleanups after dead processes. Each one reads the directory of all nodes, and nothing depends on
+/// its result.
+const CLEANUP_INTERVAL: Nanos = 5_000 * MILLIS;

@@ -1,5 +1,4 @@
-//! This machine as the surroundings of a link: its clocks, ports, shared memory, files, and service manager. Decides
-//! nothing.
+//! Platform of a link on this machine: clocks, ports, shared memory, files, and the service manager.
 
 use std::cell::{Cell, OnceCell, RefCell};
 use std::fs::File;
@@ -24,20 +23,21 @@ use crate::reconnect::LiveLink;
 use crate::saved_state::SaveSlot;
 use crate::service::Service;
 
-/// What the machine has for one link; stays in the link's thread.
+/// Platform of one link. It stays in the thread of the link.
 pub(crate) struct System<'a> {
-    hub: Hub<'a>,
+    hub: LinkResources<'a>,
     sensor: &'a str,
     /// Empty while another process has the sensor's name.
     name: OnceCell<HeldName>,
-    /// Set whenever the link finished something.
+    /// Set whenever the link has finished something.
     worked: &'a AtomicBool,
     save_slot: Option<SaveSlot<'a>>,
     /// The connection that is being made.
     dial: RefCell<Option<Dial>>,
-    /// When requests, the hub's end and the line were looked at last.
-    looked_at: Cell<Nanos>,
-    /// What outlives a killed hub; nothing where it cannot be written: then the sensor is asked.
+    /// Time of the last poll for requests, the end of the hub, and the line.
+    polled_at: Cell<Nanos>,
+    /// File of the record that outlives a killed hub; `None` if it cannot be written. The next hub then has to identify
+    /// the scanner again.
     record: OnceCell<Option<File>>,
 }
 
@@ -48,15 +48,15 @@ struct HeldName {
     _lock: NameLock,
 }
 
-/// What a hub has for a link.
+/// Resources of the hub that a link borrows.
 #[derive(Clone, Copy)]
-pub(crate) struct Hub<'a> {
+pub(crate) struct LinkResources<'a> {
     pub(crate) node: &'a Node,
-    /// What the link's topics are made for.
+    /// Limits of the link's topics.
     pub(crate) limits: TopicLimits,
-    /// Readable once the hub shall end.
+    /// Readable once the hub must end.
     pub(crate) stop: &'a OwnedFd,
-    /// Keeps the ports when the hub is killed.
+    /// Keeps the ports open if the hub is killed.
     pub(crate) service: &'a Service,
     /// The domain's directory.
     pub(crate) root: &'a Path,
@@ -66,20 +66,20 @@ impl<'a> System<'a> {
     /// Creates the platform of the link of `sensor` from the resources of `hub`. The link sets `worked` whenever it
     /// has finished something, and hands state over to `save_slot`.
     pub(crate) fn new(
-        hub: Hub<'a>,
+        hub: LinkResources<'a>,
         sensor: &'a str,
         worked: &'a AtomicBool,
         save_slot: Option<SaveSlot<'a>>,
     ) -> System<'a> {
-        let (dial, looked_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
-        System { hub, sensor, name: OnceCell::new(), worked, save_slot, dial, looked_at, record }
+        let (dial, polled_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
+        System { hub, sensor, name: OnceCell::new(), worked, save_slot, dial, polled_at, record }
     }
 
-    /// Drives `link` until the hub ends. Calls `on_start` once with the link: as soon as it has tried to open its port,
-    /// but not later than [`START`].
+    /// Runs `link` until the hub ends. Calls `on_start` once with the link: as soon as it has tried to open its port,
+    /// but not later than [`START_TIMEOUT`].
     pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(&LiveLink<'_, Self>)) {
         let mut woken = WakeReason::Timeout;
-        let (mut on_start, start_by) = (Some(on_start), clock::now() + START);
+        let (mut on_start, start_by) = (Some(on_start), clock::now() + START_TIMEOUT);
         while woken != WakeReason::Stop {
             if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
                 on_start(&link);
@@ -102,11 +102,11 @@ impl<'a> System<'a> {
         link.end();
     }
 
-    /// Sleeps until `until`, if that is soon and everything else was looked at a moment ago: a look at descriptors,
-    /// one of them a tty's, costs more than the sleep.
+    /// Sleeps until `until` instead of polling, if that is soon and the last poll was a moment ago. Returns whether it
+    /// has. A poll of several descriptors, one of them a tty, costs more than the sleep.
     fn sleeps(&self, until: Nanos) -> bool {
         let now = clock::now();
-        let is_soon = until <= now + SHORT && now < self.looked_at.get() + UNSEEN;
+        let is_soon = until <= now + MAX_SLEEP && now < self.polled_at.get() + MAX_POLL_INTERVAL;
         if is_soon {
             std::thread::sleep(Duration::from_nanos(until.saturating_sub(now)));
             self.worked.store(true, Ordering::Relaxed);
@@ -114,7 +114,7 @@ impl<'a> System<'a> {
         is_soon
     }
 
-    /// Waits until one of the events at the descriptor, `until`, a request, or the hub's end.
+    /// Waits for one of the events at the descriptor, a request, or the end of the hub, at most until `until`.
     fn wait(
         &self,
         requests: &ControlQueue,
@@ -122,7 +122,7 @@ impl<'a> System<'a> {
         until: Nanos,
     ) -> WakeReason {
         let now = clock::now();
-        self.looked_at.set(now);
+        self.polled_at.set(now);
         let span = clock::span(now, until);
         let [stop, requests] =
             [self.hub.stop.as_fd(), requests.as_fd()].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
@@ -149,21 +149,22 @@ impl<'a> System<'a> {
         let open = || {
             let file = match Directory::open(self.hub.root) {
                 Ok(Some(directory)) => directory.file_or_new(&format!("{name}.sensor")).map(Some),
-                nowhere => nowhere.map(|_| None),
+                missing => missing.map(|_| None),
             };
-            let told = |error: &_| tracing::debug!(%error, "{name}: the learned state cannot be saved");
-            file.inspect_err(told).ok().flatten()
+            let log = |error: &_| tracing::debug!(%error, "{name}: the learned state cannot be saved");
+            file.inspect_err(log).ok().flatten()
         };
         self.record.get_or_init(open).as_ref()
     }
 }
 
 impl<'a> LinkCore<'a, System<'a>> {
-    /// Waits until `news` is readable, a request, `until`, or the hub's end; meanwhile what is due goes out.
-    pub(crate) fn wait(&mut self, news: BorrowedFd<'_>, until: Nanos) -> WakeReason {
+    /// Waits until `event` is readable, for a request, or the end of the hub, at most until `until`. Meanwhile,
+    /// publishes what is due.
+    pub(crate) fn wait(&mut self, event: BorrowedFd<'_>, until: Nanos) -> WakeReason {
         loop {
-            let bound = self.next_deadline(until, false);
-            let woken = self.platform.wait(&self.control, Some((news, PollFlags::IN)), bound);
+            let deadline = self.next_deadline(until, false);
+            let woken = self.platform.wait(&self.control, Some((event, PollFlags::IN)), deadline);
             if self.is_over(woken, until) {
                 return woken;
             }
@@ -229,7 +230,7 @@ impl Platform for System<'_> {
         while let Some(line) = self.hub.service.take(name) {
             match Port::adopt(line, source, baud).filter(|_| adopted.is_none()) {
                 Some(port) => adopted = Some(port),
-                // One that hung up: whoever keeps it would have it handed over again.
+                // The port is unusable. Otherwise, the service manager would pass it to the next hub again.
                 None => self.hub.service.forget(name),
             }
         }
@@ -277,7 +278,7 @@ impl Platform for System<'_> {
 
     fn store_record(&self, name: &str, record: &[u8]) {
         let Some(file) = self.record(name) else { return };
-        // One that cannot be written is too old soon; behind a shorter one nothing of a longer one stays.
+        // A failed write leaves a record that is soon too old. Cut the rest of a longer record off.
         let _ = file.write_all_at(record, 0).and_then(|()| file.set_len(record.len() as u64));
     }
 
@@ -336,9 +337,9 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
-/// A rest that is not longer is slept through, if requests, the hub's end and the loss of a line do not wait for
-/// longer than that.
-const SHORT: Nanos = 20 * MILLIS;
-const UNSEEN: Nanos = 50 * MILLIS;
+/// Maximum wait that is slept through.
+const MAX_SLEEP: Nanos = 20 * MILLIS;
+/// Maximum time for which requests, the end of the hub and the loss of a line may go unnoticed.
+const MAX_POLL_INTERVAL: Nanos = 50 * MILLIS;
 /// Time that the start of the hub waits for the connection to a serial server.
-const START: Nanos = 250 * MILLIS;
+const START_TIMEOUT: Nanos = 250 * MILLIS;

@@ -4,7 +4,7 @@
 use std::rc::Rc;
 
 use daemon::platform::{Wait, WaitSource, WakeReason};
-use daemon::{LiveLink, Orders, Reload, Service, StateSaver, StateStore};
+use daemon::{CommandSender, LiveLink, Reload, Service, StateSaver, StateStore};
 use schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
 use crate::event::Event;
@@ -28,7 +28,7 @@ pub(crate) fn live(world: &mut World) {
             Ending { is_killed: true, back_at: now + AGAIN }
         }
     };
-    world.orders = None;
+    world.commands = None;
     world.begins_at = ending.back_at;
     shared.board.borrow_mut().end();
     shared.tell(&Event::HubEnds { life, killed: ending.is_killed });
@@ -43,8 +43,8 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
     let (config, mut saver) = StateSaver::load(config, Disk(shared.clone()), wall_ns(world.now()))?;
     let queue = saver.as_ref().map(StateSaver::queue);
     let names = || (0..setup.sensors.len()).map(Setup::name).collect::<Vec<_>>();
-    let (orders, queues) = Orders::new(names().iter().map(String::as_str))?;
-    world.orders = Some(orders);
+    let (commands, queues) = CommandSender::new(names().iter().map(String::as_str))?;
+    world.commands = Some(commands);
     let (service, names) = (Service::default(), names());
     let mut reload = Reload::new(&config, &read, &service);
     let platform = |(number, name): (usize, &String)| SimPlatform::new(shared, number, name, queue.as_ref());
@@ -73,14 +73,14 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         }
         let now = world.now();
         if std::mem::take(&mut world.wants.reload)
-            && let Some(orders) = &world.orders
+            && let Some(commands) = &world.commands
         {
-            reload.reload(orders, now);
+            reload.reload(commands, now);
             links.iter_mut().for_each(|link| link.is_wanted = true);
         }
         for (sensor, verb) in std::mem::take(&mut world.wants.asks) {
             let model = Box::<Background>::default();
-            let asked = world.orders.as_mut().map(|orders| orders.ask(&names[sensor], verb, model));
+            let asked = world.commands.as_mut().map(|commands| commands.ask(&names[sensor], verb, model));
             match asked {
                 Some(Ok(_)) => links[sensor].is_wanted = true,
                 // Too many wait: whoever asks tries again.
@@ -93,7 +93,7 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
                 link.run(now);
             }
         }
-        while world.orders.as_ref().and_then(Orders::outcome).is_some() {}
+        while world.commands.as_ref().and_then(CommandSender::outcome).is_some() {}
         if now >= writes_at {
             let due = saver.as_mut().map(|saver| saver.flush_due(now, wall_ns(now), false));
             writes_at = due.unwrap_or(Nanos::MAX).clamp(now + WRITES, now + 10 * WRITES);

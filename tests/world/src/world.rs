@@ -5,7 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use daemon::Orders;
+use daemon::CommandSender;
 use schema::{MILLIS, Nanos, Topic, Verb};
 use sim::fault::Faults;
 
@@ -91,7 +91,7 @@ pub(crate) struct World {
     pub(crate) begins_at: Nanos,
     /// Until when its process does not run.
     pub(crate) stalled_until: Nanos,
-    pub(crate) orders: Option<Orders>,
+    pub(crate) commands: Option<CommandSender>,
     /// What is behind the hub's topics in another machine.
     pub(crate) remote: Remote,
 }
@@ -134,7 +134,7 @@ impl World {
             life: 0,
             begins_at: 0,
             stalled_until: 0,
-            orders: None,
+            commands: None,
             remote: Remote::new(plan, &setup),
         };
         for &(sensor, topic, habit, holds) in &setup.cast {

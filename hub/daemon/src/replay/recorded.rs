@@ -1,5 +1,5 @@
-//! A recording as a link plays it: what it is made of, and at which media time each of its telegrams stands. Refuses to
-//! know when that is played.
+//! A recording as a link plays it: opens it, checks that it belongs to the link, and computes the media time of its
+//! telegrams.
 
 use std::io::{self, Read};
 use std::path::Path;
@@ -11,15 +11,15 @@ use schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::MAX_GAP;
 
-/// A recording of one sensor.
+/// Recording of one sensor.
 pub(crate) enum Recorded {
-    /// Bytes as they came down a line, without stamps.
+    /// Bytes of a line, without stamps.
     Stream(Stream),
     /// Telegrams, or packets of a rotating scanner.
     Frames(Frames),
 }
 
-/// A stream of telegrams, with whatever came between them.
+/// Stream of telegrams, with all bytes between them.
 pub(crate) struct Stream {
     recording: Recording,
     pub(super) family: Family,
@@ -33,34 +33,37 @@ pub(crate) struct Frames {
     pub(super) family: Family,
     /// Whether they are telegrams that are a scan or a reply by themselves, and no packets.
     pub(super) is_whole: bool,
-    /// Of a log the metres, of others nothing.
+    /// Encoding of the ranges of a log.
     encoding: Encoding,
     /// Number of the measuring mode.
     mode: Option<u8>,
     origin: Option<Origin>,
-    /// At its beginning it is not known how values are split: the hub that recorded it learned that from a telegram.
-    is_told_later: bool,
+    /// Whether the measuring mode is unknown at the start: the hub that recorded it received the mode in a later
+    /// telegram.
+    receives_mode: bool,
 }
 
-/// The first telegram of a recording of all its sensors: media time 0.
+/// Media time 0: the first telegram of all sensors in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Origin {
-    /// By the wall clock, ns since 1970.
+    /// Wall clock, in ns since 1970.
     pub(crate) wall_ns: u64,
-    /// By the monotonic clock of a life of a hub: wall clocks are set now and then.
-    life: Option<(u64, Nanos)>,
+    /// Run of the hub and its monotonic clock, because a wall clock may be set.
+    run: Option<(u64, Nanos)>,
 }
 
 impl Recorded {
-    /// Opens the recording at `path`: of several sensors the one that has the name of `link`.
+    /// Opens the recording at `path`. If it has several sensors, the link plays the one with its name. A file without a
+    /// telegram counts as a line with noise.
     ///
-    /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram
-    /// is a line that only brings noise.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if it cannot be read, and [`Kind::Configuration`] if it has other sensors.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open_line(path, link.family())?;
-        tell_of_damage(&recording);
+        log_damage(&recording);
         if recording.contents().sensors.len() > 1 {
-            // Its name is configured, and not a word of somebody who asks.
+            // The configuration names the sensor, not an argument of the user.
             let part = recording.of(&link.name);
             let part = part.map_err(|failure| Failure { kind: Kind::Configuration, ..failure })?;
             return Recorded::new(part, link);
@@ -68,10 +71,13 @@ impl Recorded {
         Recorded::new(recording, link)
     }
 
-    /// `recording`, which is of one sensor, as the link of `link`; says how the ranges of a log are read.
+    /// Creates the recording that `link` plays from `recording` of one sensor, and logs how the ranges of a log are
+    /// read.
     ///
-    /// [`Kind::Input`] if it is of a family that this version does not know, [`Kind::Configuration`] if it is not of
-    /// the link's.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if this version does not have the family of the scanner, and [`Kind::Configuration`] if
+    /// the family is not that of the link.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
         let family = check_family(&recording, link)?;
         if !features(family).has_whole_telegrams {
@@ -82,25 +88,25 @@ impl Recorded {
                 encoding: Encoding::default(),
                 mode: None,
                 origin: None,
-                is_told_later: false,
+                receives_mode: false,
             };
             frames.origin = frames.read()?.next().as_ref().and_then(Origin::of);
             return Ok(Recorded::Frames(frames));
         }
-        tell_of_log(&recording, &link.name);
+        log_encoding(&recording, &link.name);
         let mode = recording.contents().mode_or(configured_mode(link));
-        tell_of_mode(&recording, link);
+        log_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
             return Ok(Recorded::Stream(Stream { recording, family, mode }));
         }
         let encoding = recording.contents().encoding(mode);
         let mut frames =
-            Frames { recording, family, is_whole: true, encoding, mode, origin: None, is_told_later: false };
-        let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
+            Frames { recording, family, is_whole: true, encoding, mode, origin: None, receives_mode: false };
+        let mut first = frames.read()?.take(MODE_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
         let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
-        frames.is_told_later = is_open && first.any(|frame| frame.tells_mode());
+        frames.receives_mode = is_open && first.any(|frame| frame.tells_mode());
         Ok(Recorded::Frames(frames))
     }
 
@@ -112,8 +118,8 @@ impl Recorded {
         }
     }
 
-    /// Returns the sensor's type, if a status of the recording has it. The recording may also contain a scanner of another
-    /// family, which is not played.
+    /// Returns the sensor's type, if a status of the recording has it. The recording may also contain a scanner of
+    /// another family, which is not played.
     pub(super) fn sensor_type(&self) -> Option<&str> {
         let (Recorded::Stream(Stream { recording, family, .. })
         | Recorded::Frames(Frames { recording, family, .. })) = self;
@@ -121,7 +127,7 @@ impl Recorded {
         (*number == *family as u8).then_some(name.as_str())
     }
 
-    /// Where its media time begins, of what has stamps.
+    /// Returns the start of its media time; `None` without stamps.
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {
             Recorded::Stream(_) => None,
@@ -129,19 +135,19 @@ impl Recorded {
         }
     }
 
-    /// Lets its media time begin at `origin`, at which that of others begins.
+    /// Sets the start of its media time to `origin`, which it shares with other recordings.
     pub(crate) fn set_origin(&mut self, origin: Origin) {
         if let Recorded::Frames(frames) = self {
             frames.origin = Some(origin);
         }
     }
 
-    /// Wall clock of its beginning.
+    /// Returns the wall clock at its start.
     pub(super) fn begin_ns(&self) -> Option<u64> {
         self.origin().map(|origin| origin.wall_ns)
     }
 
-    /// Returns the message why no scan can be read; an empty string if they can.
+    /// Returns a message if no scan of the recording can be read; otherwise an empty string.
     pub(super) fn problem(&self, name: &str) -> String {
         let (Recorded::Stream(Stream { mode, recording, .. })
         | Recorded::Frames(Frames { mode, recording, .. })) = self;
@@ -154,7 +160,7 @@ impl Recorded {
         format!("the recording does not contain its measuring mode: no scans; set link.{name}.mode")
     }
 
-    /// Media time of its end, as far as that is known.
+    /// Returns the media time of its end, if it is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
         let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
         let contents = recording.contents();
@@ -165,7 +171,7 @@ impl Recorded {
         }
     }
 
-    /// Media time of its last telegram, for which all of it is read where it has stamps.
+    /// Returns the media time of its last telegram. A recording with stamps is read to its end for this.
     pub(crate) fn end(&self) -> Result<Nanos, Failure> {
         match self {
             Recorded::Frames(frames) if frames.has_stamps() => {
@@ -178,12 +184,12 @@ impl Recorded {
 }
 
 impl Stream {
-    /// Whether there is any telegram in it.
+    /// Returns whether it has any telegram.
     pub(super) fn has_telegrams(&self) -> bool {
         self.recording.contents().telegrams > 0
     }
 
-    /// Its bytes from the beginning.
+    /// Returns its bytes from the start.
     pub(super) fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         self.recording.bytes()
     }
@@ -194,7 +200,7 @@ impl Stream {
     }
 }
 
-/// Reads into `room`; none at the end, which is also where the file has become unreadable.
+/// Reads into `room`. Returns 0 at the end, and if the file has become unreadable.
 pub(super) fn read(bytes: &mut dyn Read, room: &mut [u8]) -> usize {
     loop {
         match bytes.read(room) {
@@ -209,14 +215,15 @@ pub(super) fn read(bytes: &mut dyn Read, room: &mut [u8]) -> usize {
 }
 
 impl Frames {
-    /// Its telegrams from the beginning.
+    /// Returns its telegrams from the start.
     pub(super) fn read(&self) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         self.recording.telegrams(self.encoding)
     }
 
-    /// Returns the settings of a session that reads it for `link`. Settings that are not configured come from the recording.
+    /// Returns the settings of a session that reads it for `link`. Settings that are not configured come from the
+    /// recording.
     pub(super) fn settings(&self, link: &Link) -> Settings {
-        let mode_number = self.mode.filter(|_| !self.is_told_later);
+        let mode_number = self.mode.filter(|_| !self.receives_mode);
         let mut settings = Settings { mode_number, ..link.settings() };
         if !self.is_whole && link.scanner.is_auto() {
             let model = self.recording.model().ok().flatten();
@@ -227,13 +234,13 @@ impl Frames {
         settings
     }
 
-    /// Number of the first telegram whose values the hub could read, in the life that begins with that of `header`.
+    /// Returns the number of the first telegram whose values the hub could read, in the run that starts with `header`.
     pub(super) fn understood_from(&self, header: &Header) -> u64 {
         let understood = is_first(header).then(|| self.recording.understood(header.boot));
         understood.flatten().unwrap_or(0)
     }
 
-    /// Media time, from the beginning.
+    /// Returns the timeline from the start.
     pub(super) fn timeline(&self) -> Timeline {
         Timeline::new(self.origin)
     }
@@ -243,29 +250,29 @@ impl Frames {
         self.recording.contents().period(beams)
     }
 
-    /// Whether it has stamps at all.
+    /// Returns whether it has stamps.
     pub(super) fn has_stamps(&self) -> bool {
         self.origin.is_some()
     }
 }
 
-/// Media time of one telegram after the other: it never goes back. A wall clock that is set while a hub lives does not
-/// matter; one that was set back since goes on where the telegram before was.
+/// Media time of consecutive telegrams, which never decreases. Within a run of the hub, the monotonic clock counts. If
+/// the wall clock was set back between two runs, the second one continues at the time of the last telegram.
 pub(super) struct Timeline {
     /// The wall clock at media time 0.
     wall_zero_ns: i128,
-    /// A life of a hub, and its monotonic clock at media time 0.
-    life: Option<(u64, i128)>,
+    /// Run of the hub, and its monotonic clock at media time 0.
+    run: Option<(u64, i128)>,
     last: Nanos,
 }
 
 impl Timeline {
     /// Creates one for a recording whose media time begins at `origin`.
     pub(super) fn new(origin: Option<Origin>) -> Timeline {
-        let life = origin.and_then(|origin| origin.life);
+        let run = origin.and_then(|origin| origin.run);
         Timeline {
             wall_zero_ns: i128::from(origin.map_or(0, |origin| origin.wall_ns)),
-            life: life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
+            run: run.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
             last: 0,
         }
     }
@@ -275,24 +282,24 @@ impl Timeline {
     /// restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
     pub(super) fn media_beside(&self, header: &Header) -> Option<Nanos> {
         let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
-        let by_stamp = self.life.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
+        let by_stamp = self.run.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
         let media = Nanos::try_from(by_stamp.unwrap_or(by_wall)).ok()?;
         (media.saturating_add(MAX_GAP) >= self.last).then_some(media)
     }
 
-    /// The media time of `frame`, which comes next.
+    /// Returns the media time of the next `frame`.
     pub(super) fn media(&mut self, frame: &Frame) -> Nanos {
         if let Some(scanner_ns) = frame.scanner_ns {
             self.last = self.last.max(scanner_ns);
             return self.last;
         }
-        let media = match (frame.header, self.life) {
+        let media = match (frame.header, self.run) {
             (Some(header), Some((boot, zero_ns))) if boot == header.boot => {
                 i128::from(header.stamp_first_ns) - zero_ns
             }
             (header, _) => {
                 let media = self.by_wall_clock(frame);
-                self.life = header.map(|header| (header.boot, i128::from(header.stamp_first_ns) - media));
+                self.run = header.map(|header| (header.boot, i128::from(header.stamp_first_ns) - media));
                 media
             }
         };
@@ -300,7 +307,7 @@ impl Timeline {
         self.last
     }
 
-    /// Something that took so long has no time of its own.
+    /// Advances by `period`, for a frame without a time.
     pub(super) fn pass(&mut self, period: Nanos) {
         self.last = self.last.saturating_add(period);
     }
@@ -317,13 +324,13 @@ impl Timeline {
 
 impl Origin {
     fn of(frame: &Frame) -> Option<Origin> {
-        let life = frame.header.map(|header| (header.boot, header.stamp_first_ns));
-        Some(Origin { wall_ns: frame.wall_ns?, life })
+        let run = frame.header.map(|header| (header.boot, header.stamp_first_ns));
+        Some(Origin { wall_ns: frame.wall_ns?, run })
     }
 
-    /// The earlier one of both.
+    /// Returns the earlier one of both.
     pub(crate) fn earlier(self, other: Origin) -> Origin {
-        let is_earlier = match (self.life, other.life) {
+        let is_earlier = match (self.run, other.run) {
             (Some((boot, stamp_ns)), Some((same, other_ns))) if boot == same => stamp_ns <= other_ns,
             _ => self.wall_ns <= other.wall_ns,
         };
@@ -356,8 +363,8 @@ fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
     Err(Failure::new(Kind::Configuration, message, hint))
 }
 
-/// That the values are read in a way which neither the recording nor the configuration tells.
-fn tell_of_mode(recording: &Recording, link: &Link) {
+/// Logs that neither the recording nor the configuration has the measuring mode, so that a default is used.
+fn log_mode(recording: &Recording, link: &Link) {
     let contents = recording.contents();
     if contents.mode.is_none()
         && configured_mode(link).is_none()
@@ -371,16 +378,16 @@ fn tell_of_mode(recording: &Recording, link: &Link) {
     }
 }
 
-/// What is missing of it, if anything is.
-pub(crate) fn tell_of_damage(recording: &Recording) {
+/// Logs the damage of a recording.
+pub(crate) fn log_damage(recording: &Recording) {
     let damage = recording.contents().damage;
     if !damage.is_none() {
         tracing::warn!("{}: missing: {damage}", recording.path().display());
     }
 }
 
-/// How the ranges of a log are read, and what of them goes into no value.
-fn tell_of_log(recording: &Recording, name: &str) {
+/// Logs how the ranges of a CARMEN log are read, and which of them have no value.
+fn log_encoding(recording: &Recording, name: &str) {
     let contents = recording.contents();
     let Some(encoding) = recording.encoding().filter(|_| contents.form == Form::Carmen) else { return };
     tracing::info!("{name}: a CARMEN log, read as {encoding}");
@@ -389,7 +396,7 @@ fn tell_of_log(recording: &Recording, name: &str) {
     }
 }
 
-/// Whether it is of the first telegram that a hub had: who converts a stream is no hub.
+/// Returns whether `header` belongs to the first telegram of a hub. A converted stream has no hub.
 fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
 }
@@ -399,8 +406,8 @@ fn configured_mode(link: &Link) -> Option<u8> {
     link.scanner.settings.mode_number
 }
 
-/// A hub that found a sensor streaming has asked it within so many telegrams.
-const ASKED_WITHIN: usize = 500;
+/// Number of telegrams within which a hub that found a streaming scanner has requested its mode.
+const MODE_WITHIN: usize = 500;
 
 #[cfg(test)]
 mod tests {
@@ -419,13 +426,13 @@ mod tests {
     }
 
     #[test]
-    fn where_the_wall_clock_was_set_the_monotonic_one_goes_on() {
+    fn monotonic_clock_counts_when_the_wall_clock_was_set() {
         let header =
             |boot, stamp_s: u64| Some(Header { boot, stamp_first_ns: stamp_s * SECOND, ..Header::default() });
         let frames = [
             frame(5000, header(1, 100)),
             frame(9000, header(1, 101)),
-            // Another life, and the clock is right again.
+            // Another run, and the clock is right again.
             frame(5003, header(2, 7)),
             frame(5004, header(2, 8)),
             // And is set within it.
@@ -468,7 +475,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_whose_clock_was_set_back_goes_on() {
+    fn log_whose_clock_was_set_back_continues() {
         let walls = [5000, 5001, 5000, 5002, 10, 11, 12, 5000];
         let frames = walls.map(|wall_s| frame(wall_s, None));
         assert_eq!(medias(&frames), [0, 1, 1, 2, 2, 3, 4, 4992]);
