@@ -159,7 +159,9 @@ impl<'a> ScannerRequest<'a> {
         let mode = keys.mode.as_ref().map(ToString::to_string).unwrap_or_default();
         for key in Key::ALL {
             let value = match &values[key.name()] {
-                Json::Null => continue,
+                Json::Null if find(table, key.name()).is_none() => continue,
+                // JSON has neither NaN nor infinity.
+                Json::Null if key.name() != "mode" => Value::Number(f64::NAN),
                 Json::String(text) => Value::Text(text),
                 Json::Number(number) => match (number.as_i64(), number.as_f64()) {
                     (Some(number), _) => Value::Whole(number),

@@ -1,5 +1,8 @@
 //! Sections of the configuration. Each is one struct of the macro [`section!`]: a field is a key, with its description, its
 //! default and its check.
+//!
+//! To add a key, add a field and the line that uses it, and generate the default configuration and the page again
+//! (`hub/config/tests/reference.rs`). A key of a scanner also has an entry in `hub/drivers/src/settings.rs`.
 
 use std::borrow::Borrow;
 use std::ops::RangeInclusive;

@@ -146,6 +146,7 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
 fn what_cannot_be_is_refused_with_place_value_and_remedy() {
     for (setting, words) in [
         ("link.front.pose.x=nan", "x = NaN\n  metres"),
+        ("link.front.pose=[1, 2]", "pose is a list\n  write it as [pose]"),
         ("link.front.pose.y=300", "y = 300\n  metres from the robot's centre, at most 100"),
         ("link.front.pose.yaw=90", "yaw = 90\n  radians, counter-clockwise: 90 degrees are 1.5708"),
         (

@@ -119,6 +119,8 @@ fn a_link_has_a_family_and_what_its_family_needs() {
             "link front: mode = \"express\"\n  0x00 to 0x06, or 0x0F",
         ),
         (&[], "mode=1.5", "mode = 1.5\n  0x00 to 0x06, or 0x0F"),
+        (&[], "mode=nan", "mode = nan\n  0x00 to 0x06, or 0x0F"),
+        (&[], "angle=nan", "angle = NaN\n  100 or 180"),
         (
             &[family],
             "idle=stop",

@@ -1,4 +1,4 @@
-//! Settings of a scanner: the keys of a configuration, and the settings of a session. A family says which keys only it has,
+//! Settings of a scanner: the keys of a configuration, and the settings of a session. A family lists the keys that only it has,
 //! and checks their values. A configuration adds the place of each key.
 
 use std::fmt;
