@@ -149,7 +149,7 @@ section! {
         model: Option<String> = None, example "\"auto\"";
         /// of a scan, 2 to 8192; default: as many points as the model measures per revolution
         ///
-        /// Number of beams of a scan of a rotating scanner, 2 to 8192. Default: as many points as the model measures per
+        /// Beams per scan for a rotating scanner, 2 to 8192. Default: as many points as the model measures per
         /// revolution.
         beams: Option<i64> = None, example "450";
         /// degrees, 100 or 180
