@@ -1,4 +1,4 @@
-//! The tables of topics in Python and Lua say what the one in Rust says. Those of C and of `scanhub_lan.py` are generated.
+//! The table of topics in the Python package is that of Rust. Those of other readers are generated.
 
 use std::fs;
 
@@ -26,10 +26,4 @@ fn quoted(path: &str, start: &str) -> Vec<String> {
 fn of_python() {
     let names: Vec<_> = names().collect();
     assert_eq!(quoted("clients/python/scanhub/names.py", "TOPICS = "), names);
-}
-
-#[test]
-fn of_lua() {
-    let names: Vec<_> = ["announce".to_owned()].into_iter().chain(names()).collect();
-    assert_eq!(quoted("clients/wireshark/scanhub.lua", "    [0] = \"announce\""), names);
 }

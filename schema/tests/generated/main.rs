@@ -5,6 +5,7 @@
 mod c;
 mod description;
 mod docs;
+mod lua;
 mod python;
 mod readers;
 mod rules;
@@ -98,4 +99,15 @@ fn python_is_up_to_date() {
         ("readers", python::functions(&description)),
     ];
     check_blocks("clients/python/scanhub_lan.py", &blocks);
+}
+
+#[test]
+fn lua_is_up_to_date() {
+    let description = Description::read();
+    let blocks = [
+        ("values", lua::values(&description)),
+        ("fields", lua::fields(&description)),
+        ("payloads", lua::functions(&description)),
+    ];
+    check_blocks("clients/wireshark/scanhub.lua", &blocks);
 }

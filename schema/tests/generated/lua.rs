@@ -1,0 +1,453 @@
+//! Fields and readers of payloads for `scanhub.lua`, the dissector for Wireshark.
+
+use std::fmt::Write as _;
+
+use schema::Topic;
+
+use super::description::{Description, Field, Kind, Layout, first_sentence, snake, upper_first};
+use super::readers::{self, Check, Finite, How, Shown};
+use super::{rules, wrap};
+
+const WIDTH: usize = 120;
+
+/// Payloads whose arrays are read by hand, because they depend on each other. Only their heads are generated.
+const HEADS: [&str; 2] = ["Scan", "Foreground"];
+
+/// Returns the names of topics and of values.
+pub(crate) fn values(description: &Description) -> String {
+    let topics = ["announce"].into_iter().chain(Topic::ALL.map(Topic::name));
+    let mut text = table("TOPICS", "[0] = ", topics.map(str::to_owned));
+    let mut written = Vec::new();
+    for field in description.layouts.iter().flat_map(|layout| &layout.fields) {
+        let Some(set) = field.set.as_ref().filter(|set| is_enum(field, set)) else { continue };
+        if !written.contains(&set) {
+            written.push(set);
+            let first = if set == "Counter" { "" } else { "[0] = " };
+            let names = description.sets[set].values.iter().map(|value| value.name.clone());
+            text += &table(&names_of(set), first, names);
+        }
+    }
+    text
+}
+
+fn table(name: &str, first: &str, values: impl Iterator<Item = String>) -> String {
+    let values: Vec<_> = values.map(|value| format!("\"{value}\"")).collect();
+    let line = format!("local {name} = {{ {first}{} }}\n", values.join(", "));
+    if line.len() <= WIDTH {
+        return line;
+    }
+    let values = format!("{first}{},", values.join(", "));
+    format!("local {name} = {{\n{}}}\n", wrap("    ", "    ", &values, WIDTH))
+}
+
+/// Returns whether the field has one of the set's values instead of bits.
+fn is_enum(field: &Field, set: &str) -> bool {
+    !["flags", "reasons", "contents"].contains(&field.name.as_str()) && set != "Quality"
+}
+
+/// Returns the name of the table with the names of an enum's values.
+fn names_of(set: &str) -> String {
+    match set {
+        "MotionMethod" => "METHODS".to_owned(),
+        "EventKind" => "EVENTS".to_owned(),
+        "Family" => "FAMILIES".to_owned(),
+        "PointClass" => "POINT_CLASSES".to_owned(),
+        name => format!("{}S", snake(name).to_uppercase()),
+    }
+}
+
+/// Returns the declarations of the fields of all payloads.
+pub(crate) fn fields(description: &Description) -> String {
+    let mut text = String::new();
+    for (topic, layout) in payloads(description) {
+        for layout in [layout].into_iter().chain(elements(description, layout)) {
+            for shown in all(description, layout) {
+                text += &declaration(topic, layout, &shown);
+            }
+        }
+        for tail in arrays_of_numbers(description, layout) {
+            let (kind, label) = (proto(&Kind::Number(tail.kind)), first_sentence(tail.doc));
+            let label = label.split(';').next().unwrap_or_default();
+            writeln!(text, "field(\"{}.{}\", \"{kind}\", \"{label}\")", topic.name(), single(tail.name))
+                .expect("a String");
+        }
+    }
+    text
+}
+
+fn payloads(description: &Description) -> impl Iterator<Item = (Topic, &Layout)> {
+    Topic::ALL.into_iter().filter_map(|topic| Some((topic, description.payload(topic)?)))
+}
+
+/// Returns the layouts of the elements of a payload's arrays.
+fn elements<'a>(description: &'a Description, layout: &Layout) -> Vec<&'a Layout> {
+    let of_fields =
+        layout.fields[rules::head(layout).fields..].iter().filter_map(|field| match &field.kind {
+            Kind::Layout(rust) => Some(rust.as_str()),
+            _ => None,
+        });
+    let of_tail = rules::packed_tail(&layout.name).iter().map(|tail| tail.kind);
+    let names = of_fields.chain(of_tail.filter(|kind| kind.starts_with(char::is_uppercase)));
+    names.map(|rust| description.layout(rust)).collect()
+}
+
+fn arrays_of_numbers(description: &Description, layout: &Layout) -> Vec<&'static rules::Tail> {
+    let is_number = |tail: &&rules::Tail| description.layouts.iter().all(|layout| layout.rust != tail.kind);
+    let by_hand = HEADS.contains(&layout.name.as_str());
+    rules::packed_tail(&layout.name).iter().filter(|_| !by_hand).filter(is_number).collect()
+}
+
+/// Returns the fields before the first array, with those of structs in it.
+fn all<'a>(description: &'a Description, layout: &'a Layout) -> Vec<Shown<'a>> {
+    let mut all = Vec::new();
+    let counts = rules::counts(layout);
+    for shown in readers::shown(layout, &description.sets) {
+        let is_count = counts.iter().any(|(count, _)| *count == shown.field.name);
+        if is_count && shown.field.name != "count" && layout.name != "Foreground" {
+            continue;
+        }
+        match &shown.field.kind {
+            Kind::Layout(rust) => all.extend(self::all(description, description.layout(rust))),
+            _ => all.push(shown),
+        }
+    }
+    all
+}
+
+/// Returns the name of a field after that of the topic.
+fn name<'a>(shown: &'a Shown) -> &'a str {
+    match shown.name.as_str() {
+        "from_room" => "from",
+        "to_room" => "to",
+        "point_class" => "class",
+        name => name,
+    }
+}
+
+fn single(name: &str) -> &str {
+    name.strip_suffix('s').unwrap_or(name)
+}
+
+fn proto(kind: &Kind) -> String {
+    match kind {
+        Kind::Text => "string".to_owned(),
+        Kind::Number("f32") => "float".to_owned(),
+        Kind::Number("f64") => "double".to_owned(),
+        Kind::Number(number) => number.replace('u', "uint").replace('i', "int").replace("uintnt", "uint"),
+        Kind::Layout(_) => panic!("a struct has no field of its own"),
+    }
+}
+
+fn declaration(topic: Topic, layout: &Layout, shown: &Shown) -> String {
+    let field = shown.field;
+    let topic = topic.name();
+    if field.set.as_deref() == Some("Counter") {
+        return format!(
+            "for _, name in ipairs(COUNTERS) do\n    field(\"{topic}.\" .. name, \"uint64\", name)\nend\n"
+        );
+    }
+    let (label, more) = match &shown.how {
+        How::Bit(bit, _) => (upper_first(&shown.name.replace('_', " ")), format!(", base.DEC, nil, {bit}")),
+        How::Element(doc) => (upper_first(doc), String::new()),
+        How::Computed(doc) => (first_sentence(doc), String::new()),
+        How::Plain | How::Bool => {
+            let more = match field.set.as_deref() {
+                Some(set) if is_enum(field, set) => format!(", base.DEC, {}", names_of(set)),
+                Some(_) => ", base.HEX".to_owned(),
+                None if layout.name == "Status" && field.name == "mode" => ", base.HEX".to_owned(),
+                None => String::new(),
+            };
+            let label = first_sentence(&field.doc(""));
+            // Several fields may be parts of one thing, such as a pose.
+            let ends: &[char] = if field.set.is_some() { &[';', ':'] } else { &[';'] };
+            (label.split(ends).next().unwrap_or_default().trim().replace('`', ""), more)
+        }
+    };
+    let call = format!("field(\"{topic}.{}\", \"{}\", \"{label}\"{more})\n", name(shown), proto(&field.kind));
+    if call.len() <= WIDTH + 1 {
+        call
+    } else {
+        call.replace("\", \"", "\",\n    \"").replacen("\",\n    \"", "\", \"", 1)
+    }
+}
+
+/// Returns the functions that read payloads.
+pub(crate) fn functions(description: &Description) -> String {
+    let mut text = String::new();
+    for (topic, layout) in payloads(description) {
+        for element in elements(description, layout) {
+            write!(text, "\nlocal function add_{}(tree, payload, at)\n", snake(&element.name))
+                .expect("a String");
+            text += &additions(description, topic, element, "at");
+            text += "end\n";
+        }
+        if HEADS.contains(&layout.name.as_str()) {
+            text += &head(description, topic, layout);
+        } else {
+            text += &function(description, topic, layout);
+        }
+    }
+    text
+}
+
+/// Returns the functions for a payload whose arrays are read by hand.
+fn head(description: &Description, topic: Topic, layout: &Layout) -> String {
+    let topic_name = topic.name();
+    let mut text =
+        format!("\n-- The numbers of a valid head, or nothing.\nlocal function {topic_name}_head(payload)\n");
+    text += &conditions(layout);
+    text += "    return {\n";
+    for field in layout.fields.iter().filter(|field| !field.name.starts_with("reserved")) {
+        if matches!(field.kind, Kind::Number("u8" | "u16" | "u32")) {
+            writeln!(text, "        {} = {},", field.name, number(field, "")).expect("a String");
+        }
+    }
+    write!(text, "    }}\nend\n\nlocal function add_{topic_name}(tree, payload)\n").expect("a String");
+    text += &additions(description, topic, layout, "");
+    text + "end\n"
+}
+
+/// Returns the expression of a number.
+fn number(field: &Field, at: &str) -> String {
+    format!("payload({}, {}):le_uint()", offset(at, field.at), field.element)
+}
+
+fn offset(base: &str, at: usize) -> String {
+    match (base, at) {
+        ("", at) => at.to_string(),
+        (base, 0) => base.to_owned(),
+        (base, at) => format!("{base} + {at}"),
+    }
+}
+
+/// Returns the conditions that a head meets, apart from the lengths of its arrays.
+fn conditions(layout: &Layout) -> String {
+    let size = rules::first_revision(&layout.name).unwrap_or(rules::head(layout).size);
+    let mut text = format!("    if payload:len() < {size} then return nil end\n");
+    let mut refuse =
+        |condition: String| writeln!(text, "    if {condition} then return nil end").expect("a String");
+    for (count, most) in rules::counts(layout) {
+        refuse(format!("{} > {most}", number(field(layout, count), "")));
+    }
+    for check in readers::checks(&layout.name) {
+        if let Check::Within { field: name, from, to } = check {
+            let value = number(field(layout, name), "");
+            let low = if *from > 0 { format!("{value} < {from} or ") } else { String::new() };
+            refuse(format!("{low}{value} > {to}"));
+        }
+    }
+    for condition in finite(layout, "", rules::head(layout).fields) {
+        refuse(condition);
+    }
+    text
+}
+
+fn field<'a>(layout: &'a Layout, name: &str) -> &'a Field {
+    let found = layout.fields.iter().find(|field| field.name == name);
+    found.unwrap_or_else(|| panic!("{} has no {name}", layout.name))
+}
+
+/// Returns conditions that are true if a number is not finite. Neighboring numbers are checked together.
+fn finite(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
+    let mut conditions = Vec::new();
+    let mut runs: Vec<(usize, usize, usize)> = Vec::new();
+    for field in &layout.fields[..fields] {
+        let len = field.len.unwrap_or(1);
+        match (readers::finite(layout, field), runs.last_mut()) {
+            (Finite::Must, Some((at, size, count)))
+                if *size == field.element && *at + *size * *count == field.at =>
+            {
+                *count += len;
+            }
+            (Finite::Must, _) => runs.push((field.at, field.element, len)),
+            (Finite::MayBeNan, _) => {
+                conditions.push(format!(
+                    "is_infinite(payload({}, {}):le_float())",
+                    offset(base, field.at),
+                    field.element
+                ));
+            }
+            (Finite::NotChecked, _) => {}
+        }
+    }
+    let run = |(at, size, count)| {
+        let condition = format!("not are_finite(payload, {}, {size}, {count})", offset(base, at));
+        match is_later(layout, at) {
+            true => format!("payload:len() >= {} and {condition}", layout.size),
+            false => condition,
+        }
+    };
+    conditions.extend(runs.into_iter().map(run));
+    conditions
+}
+
+/// Returns whether a field at this offset is missing in revision 1.
+fn is_later(layout: &Layout, at: usize) -> bool {
+    rules::first_revision(&layout.name).is_some_and(|size| at >= size)
+}
+
+/// Returns calls that add all fields to a tree.
+fn additions(description: &Description, topic: Topic, layout: &Layout, base: &str) -> String {
+    let mut text = String::new();
+    for shown in readers::shown(layout, &description.sets) {
+        if let Kind::Layout(rust) = &shown.field.kind {
+            text += &additions(description, topic, description.layout(rust), &offset(base, shown.field.at));
+        }
+    }
+    let kept = all(description, layout);
+    for shown in
+        kept.iter().filter(|shown| layout.fields.iter().any(|field| std::ptr::eq(field, shown.field)))
+    {
+        let shown_field = shown.field;
+        let (at, len) = (offset(base, shown_field.at), shown_field.element);
+        let name = format!("{}.{}", topic.name(), name(shown));
+        let line = match (&shown.how, &shown_field.kind) {
+            (How::Computed(_), _) => {
+                // Method 1 is `refused`, and flag 2 is `open`.
+                let method = number(field(layout, "method"), base);
+                format!(
+                    "    local method = {method}\n    local is_valid = METHODS[method] and method ~= 1 and {} % 4 < 2\n    \
+                     tree:add(f[\"{name}\"], payload({at}, {len}), is_valid and 1 or 0)",
+                    number(shown_field, base)
+                )
+            }
+            (How::Element(_), _) => {
+                let at = offset(base, shown_field.at + len * shown.index);
+                format!("    tree:add_le(f[\"{name}\"], payload({at}, {len}))")
+            }
+            (_, Kind::Text) => {
+                let len = shown_field.len.unwrap_or(1);
+                let text = format!("add_text(tree, \"{name}\", payload({at}, {len}))");
+                match readers::text_only_if(layout, shown_field) {
+                    Some((of, value)) => {
+                        format!("    if {} == {value} then {text} end", number(field(layout, of), base))
+                    }
+                    None => format!("    {text}"),
+                }
+            }
+            _ if shown_field.set.as_deref() == Some("Counter") => format!(
+                "    for i, name in ipairs(COUNTERS) do\n        tree:add_le(f[\"{}.\" .. name], payload({} + {len} * i, \
+                 {len}))\n    end",
+                topic.name(),
+                offset(base, shown_field.at - len)
+            ),
+            _ => match shown_field.len {
+                Some(count) => format!(
+                    "    for i = 0, {} do\n        tree:add_le(f[\"{name}\"], payload({at} + {len} * i, {len}))\n    end",
+                    count - 1
+                ),
+                None => format!("    tree:add_le(f[\"{name}\"], payload({at}, {len}))"),
+            },
+        };
+        if is_later(layout, shown_field.at) {
+            writeln!(text, "    if payload:len() >= {} then\n    {}\n    end", layout.size, line.replace('\n', "\n    "))
+                .expect("a String");
+            continue;
+        }
+        text += &line;
+        text.push('\n');
+    }
+    text
+}
+
+fn function(description: &Description, topic: Topic, layout: &Layout) -> String {
+    let mut text = format!("\nunpack_payload[{}] = function(payload, tree)\n", topic.number());
+    text += &conditions(layout);
+    // Name, layout, variable with the number of elements, and offset.
+    let mut arrays = Vec::new();
+    let mut begin = rules::head(layout).size.to_string();
+    let mut add = |text: &mut String, name: String, element: Option<&'_ Layout>, size: usize, count: &str| {
+        let variable = if count == "count" { "count".to_owned() } else { format!("{count}_count") };
+        writeln!(text, "    local {variable} = {}", number(field(layout, count), "")).expect("a String");
+        arrays.push((name, element.map(|layout| layout.rust.clone()), size, variable.clone(), begin.clone()));
+        begin += &format!(" + {size} * {variable}");
+    };
+    for array in &layout.fields[rules::head(layout).fields..] {
+        let Kind::Layout(rust) = &array.kind else { panic!("an array of structs") };
+        let count = rules::count_of(layout, array);
+        add(&mut text, array.name.clone(), Some(description.layout(rust)), array.element, count);
+    }
+    for tail in rules::packed_tail(&layout.name) {
+        let element = description.layouts.iter().find(|layout| layout.rust == tail.kind);
+        let size = element.map_or_else(|| rules::number_size(tail.kind), |layout| layout.size);
+        add(&mut text, tail.name.to_owned(), element, size, tail.count);
+    }
+    if !arrays.is_empty() {
+        writeln!(text, "    if payload:len() < {begin} then return nil end").expect("a String");
+    }
+    for (name, element, size, count, begin) in &arrays {
+        let Some(element) = element.as_ref().map(|rust| description.layout(rust)) else { continue };
+        let mut conditions = finite(element, "at", element.fields.len());
+        for check in readers::checks(&layout.name) {
+            match check {
+                Check::Below { array, field: of, count } if array == name => {
+                    conditions.push(format!("{} >= {count}", number(field(element, of), "at")));
+                }
+                Check::Bits { array, field: of, count } if array == name => {
+                    conditions.push(format!("{} >= 2 ^ {count}_count", number(field(element, of), "at")));
+                }
+                _ => {}
+            }
+        }
+        if !conditions.is_empty() {
+            writeln!(text, "    for i = 0, {count} - 1 do\n        local at = {begin} + {size} * i")
+                .expect("a String");
+            for condition in conditions {
+                writeln!(text, "        if {condition} then return nil end").expect("a String");
+            }
+            text += "    end\n";
+        }
+    }
+    text += &additions(description, topic, layout, "");
+    for (name, element, size, count, begin) in &arrays {
+        writeln!(text, "    for i = 0, {count} - 1 do\n        local at = {begin} + {size} * i")
+            .expect("a String");
+        match element.as_ref().map(|rust| description.layout(rust)) {
+            Some(element) => {
+                let item = format!("tree:add(payload(at, {size}), \"{} \" .. i)", element.name);
+                writeln!(text, "        add_{}({item}, payload, at)", snake(&element.name))
+            }
+            None => {
+                let field = format!("f[\"{}.{}\"]", topic.name(), single(name));
+                writeln!(text, "        tree:add_le({field}, payload(at, {size})):prepend_text(i .. \": \")")
+            }
+        }
+        .expect("a String");
+        text += "    end\n";
+    }
+    let arrays: Vec<_> =
+        arrays.iter().map(|(name, _, _, count, _)| (name.as_str(), count.as_str())).collect();
+    text += &summary(description, layout, &arrays);
+    text += "end\n";
+    text
+}
+
+/// Returns the lines that return the text for the column "Info": the name of a value, numbers of elements, and the flags that
+/// are set.
+fn summary(description: &Description, layout: &Layout, arrays: &[(&str, &str)]) -> String {
+    let mut parts = Vec::new();
+    let values = layout.fields[..rules::head(layout).fields].iter();
+    let main = values.clone().find(|field| {
+        field.set.as_ref().is_some_and(|set| is_enum(field, set) && set != "Counter" && set != "Family")
+    });
+    if let Some((field, set)) = main.and_then(|field| Some((field, field.set.as_ref()?))) {
+        let other = readers::other_value(set).unwrap_or("unknown");
+        parts.push(format!("({}[{}] or \"{other}\")", names_of(set), number(field, "")));
+    } else if layout.name == "Tilt" {
+        parts.push("string.format(\"%.2f deg\", math.deg(payload(0, 8):le_float()))".to_owned());
+    }
+    for (name, count) in arrays {
+        let name = name.replace("_array", "s");
+        let comma = if parts.is_empty() { "" } else { "\", \" .. " };
+        parts.push(format!("{comma}{count} .. \" {name}\""));
+    }
+    let mut text = format!("    local words = {}\n", parts.join(" .. "));
+    for shown in readers::shown(layout, &description.sets) {
+        if let How::Bit(bit, _) = shown.how {
+            let (value, name) = (number(shown.field, ""), shown.name.replace('_', " "));
+            writeln!(text, "    if {value} % {} >= {bit} then words = words .. \", {name}\" end", 2 * bit)
+                .expect("a String");
+        }
+    }
+    text + "    return words\n"
+}
