@@ -152,7 +152,7 @@ fn comment(field: &Field) -> String {
 }
 
 /// Returns a line with its comment, which is above it if it is too long.
-fn commented(line: &str, comment: &str) -> String {
+pub(crate) fn commented(line: &str, comment: &str) -> String {
     let indent = &line[..line.len() - line.trim_start().len()];
     let beside = format!("{line} /* {comment} */");
     if comment.is_empty() {
@@ -165,7 +165,7 @@ fn commented(line: &str, comment: &str) -> String {
 }
 
 /// Returns a comment in lines of its own.
-fn above(indent: &str, comment: &str) -> String {
+pub(crate) fn above(indent: &str, comment: &str) -> String {
     // The end of the comment stays on the line of the last word.
     let lines = wrap(&format!("{indent}/* "), &format!("{indent} * "), &format!("{comment}\u{1}*/"), WIDTH);
     lines.replace('\u{1}', " ")

@@ -1,8 +1,10 @@
 //! Tables of `docs/topics.md` and `docs/datagram.md`.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use schema::Topic;
+use schema::datagram::Announce;
+use schema::{Maker, Topic};
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first};
 use super::rules::{self, Tail};
@@ -114,6 +116,45 @@ pub(crate) fn payloads(description: &Description) -> String {
             let size = if element == 1 { (*count).to_owned() } else { format!("{element} {count}") };
             row(size, format!("`{name}`, each {of}{condition}"));
         }
+    }
+    text + "\n"
+}
+
+/// Returns the table of the services of all topics.
+pub(crate) fn services() -> String {
+    let mut text = "\n| service | pattern, payload | history | buffer |\n|---|---|---|---|\n".to_owned();
+    for topic in Topic::ALL {
+        let owner = match topic.maker() {
+            Maker::Link => "SENSOR",
+            Maker::Tracker => "TRACKER",
+            Maker::Mount => "MOUNT",
+            Maker::Tilted => "NAME",
+        };
+        let payload =
+            match (topic.payload(), topic.payload().trim_start_matches("scanhub.").trim_end_matches(".v2")) {
+                ("u8[]", _) => format!("`[u8]`, at most {}", schema::Telegram::MAX),
+                (payload, name) if rules::tail(name).is_empty() => format!("`{payload}`"),
+                (payload, _) => format!("`[{payload}]`"),
+            };
+        let row = topic.row();
+        let service = topic.service(owner);
+        writeln!(text, "| `{service}` | publish-subscribe, {payload} | {} | {} |", row.kept, row.waiting)
+            .expect("a String");
+    }
+    text + "\n"
+}
+
+/// Returns the table of the multicast groups with their topics.
+pub(crate) fn groups() -> String {
+    let mut text = "\n| group, port 22200 | topics with their numbers |\n|---|---|\n".to_owned();
+    let announce = (Announce::GROUP, format!("{} announce", Announce::NUMBER));
+    let topics = Topic::ALL.map(|topic| (topic.row().group, format!("{} {}", topic.number(), topic.name())));
+    let all: Vec<_> = [announce].into_iter().chain(topics).collect();
+    let groups: BTreeSet<u8> = all.iter().map(|(group, _)| *group).collect();
+    for group in groups {
+        let topics: Vec<_> =
+            all.iter().filter(|(of, _)| *of == group).map(|(_, topic)| topic.as_str()).collect();
+        writeln!(text, "| 239.255.76.{group} | {} |", topics.join(", ")).expect("a String");
     }
     text + "\n"
 }

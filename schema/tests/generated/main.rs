@@ -3,6 +3,7 @@
 //! them.
 
 mod c;
+mod datagram_c;
 mod description;
 mod docs;
 mod lua;
@@ -74,6 +75,9 @@ fn c_is_up_to_date() {
     let description = Description::read();
     let blocks = [("structs", c::structs(&description)), ("checks", c::checks(&description))];
     check_blocks("clients/c/include/scanhub/attach.h", &blocks);
+    let payloads =
+        [("values", datagram_c::values(&description)), ("payloads", datagram_c::payloads(&description))];
+    check_blocks("clients/c/scanhub.h", &payloads);
     check_blocks("clients/c/include/scanhub/attach.hpp", &[("topics", c::topics(&description))]);
 }
 
@@ -86,7 +90,9 @@ fn pages_are_up_to_date() {
     let tables: Vec<_> =
         layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
     check_blocks("docs/topics.md", &tables);
-    check_blocks("docs/datagram.md", &[("payloads", docs::payloads(&description))]);
+    check_blocks("docs/topics.md", &[("services", docs::services())]);
+    let blocks = [("payloads", docs::payloads(&description)), ("groups", docs::groups())];
+    check_blocks("docs/datagram.md", &blocks);
 }
 
 #[test]
