@@ -6,8 +6,7 @@
 //! 2. **Frame**: [`SessionDriver::drain`] asks the session for its next action. A telegram stays in that buffer; a
 //!    revolution is a list of points.
 //! 3. **Decode, process, send, ring**: [`LinkOutput`](crate::link_output::LinkOutput) publishes the telegram and the
-//! scan,
-//!    wakes the subscribers of both and of the zones, and then publishes the other results.
+//!    scan, wakes the subscribers of both and of the zones, and then publishes the other results.
 //!
 //! Nothing on this path allocates, locks or logs. Opening and reopening the port is up to `reconnect.rs`.
 

@@ -340,8 +340,13 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
             },
         };
         if is_later(layout, shown_field.at) {
-            writeln!(text, "    if payload:len() >= {} then\n    {}\n    end", layout.size, line.replace('\n', "\n    "))
-                .expect("a String");
+            writeln!(
+                text,
+                "    if payload:len() >= {} then\n    {}\n    end",
+                layout.size,
+                line.replace('\n', "\n    ")
+            )
+            .expect("a String");
             continue;
         }
         text += &line;
