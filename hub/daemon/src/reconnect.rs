@@ -39,15 +39,15 @@ struct OpenedPort<L> {
 /// State of the port.
 enum Phase<L> {
     Open(Box<OpenLine<L>>),
-    /// Unavailable. The link tries to open it at `retry_at`, and the next wait ends at `until`.
+    /// The link tries to open it at `retry_at`, and the next wait ends at `until`.
     Unavailable {
-        reason: Unavailable,
+        reason: PortUnavailable,
         retry_at: Nanos,
         until: Nanos,
     },
-    /// Being opened. The next wait ends at `until`.
+    /// A connection is being made. The next wait ends at `until`.
     Opening {
-        reason: Unavailable,
+        reason: PortUnavailable,
         until: Nanos,
     },
 }
@@ -80,11 +80,11 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         core.begin();
         let driver = SessionDriver::new(&core);
         let saved_identity = driver.saved_identity(platform.now());
-        let phase = Phase::unavailable(Unavailable::default(), 0);
+        let phase = Phase::unavailable(PortUnavailable::default(), 0);
         let lacks_name = taken.is_some();
         let mut live = LiveLink { core, driver, phase, empty_connections: 0, has_begun: false, lacks_name };
         if let Some(failure) = taken {
-            live.schedule_retry(Unavailable::without_name(failure));
+            live.schedule_retry(PortUnavailable::without_name(failure));
             return Ok(live);
         }
         match live.open_first() {
@@ -96,7 +96,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
             }
             Ok(None) => {
                 let message = format!("{}: not connected yet", link.port.name());
-                live.schedule_retry(Unavailable { message, ..Unavailable::default() });
+                live.schedule_retry(PortUnavailable { message, ..PortUnavailable::default() });
                 Ok(live)
             }
             // Only the hub plays recordings, so the hint of the port does not name them.
@@ -107,7 +107,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
             }
             Err(error @ PortError::Short(_)) => Err(platform.explain(&error, &link.port)),
             Err(error) => {
-                let mut reason = Unavailable::default();
+                let mut reason = PortUnavailable::default();
                 reason.update(&error, platform.now(), |error| one_line(platform.explain(error, &link.port)));
                 live.schedule_retry(reason);
                 Ok(live)
@@ -215,7 +215,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         if self.lacks_name
             && let Err(failure) = platform.take_name()
         {
-            return self.schedule_retry(Unavailable::without_name(failure));
+            return self.schedule_retry(PortUnavailable::without_name(failure));
         }
         let baud = self.driver.opening_rate(&self.core);
         // While the link had no name, it has not taken the line that was kept for it.
@@ -284,7 +284,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     fn on_line_lost(&mut self, error: &io::Error) {
         let source = &self.core.link.port;
         let Phase::Open(open) =
-            std::mem::replace(&mut self.phase, Phase::unavailable(Unavailable::default(), 0))
+            std::mem::replace(&mut self.phase, Phase::unavailable(PortUnavailable::default(), 0))
         else {
             return;
         };
@@ -298,11 +298,11 @@ impl<'a, S: Platform> LiveLink<'a, S> {
         let message = format!("{} went away: {error}", source.name());
         self.core.diagnosis.note_empty_connection(if has_received { String::new() } else { message.clone() });
         let failures = self.empty_connections;
-        self.schedule_retry(Unavailable { failures, ..Unavailable::missing(message) });
+        self.schedule_retry(PortUnavailable { failures, ..PortUnavailable::missing(message) });
     }
 
     /// Publishes that the port is unavailable, and schedules the next attempt to open it.
-    fn schedule_retry(&mut self, reason: Unavailable) {
+    fn schedule_retry(&mut self, reason: PortUnavailable) {
         self.core.diagnosis.end_session();
         self.core.show(None, State::Absent, &reason.message);
         let retry_at = self.core.platform.now() + reason.retry_interval();
@@ -328,7 +328,7 @@ impl<'a, S: Platform> LiveLink<'a, S> {
 }
 
 impl<L: Line> Phase<L> {
-    fn unavailable(reason: Unavailable, retry_at: Nanos) -> Phase<L> {
+    fn unavailable(reason: PortUnavailable, retry_at: Nanos) -> Phase<L> {
         Phase::Unavailable { reason, retry_at, until: retry_at }
     }
 
@@ -342,9 +342,9 @@ impl<L: Line> Phase<L> {
     }
 
     /// Takes the reason why the port was unavailable until now.
-    fn take_reason(&mut self) -> Unavailable {
+    fn take_reason(&mut self) -> PortUnavailable {
         match self {
-            Phase::Open(_) => Unavailable::default(),
+            Phase::Open(_) => PortUnavailable::default(),
             Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. } => std::mem::take(reason),
         }
     }
@@ -352,7 +352,7 @@ impl<L: Line> Phase<L> {
 
 /// Reason why a port is unavailable.
 #[derive(Default)]
-struct Unavailable {
+struct PortUnavailable {
     error: Option<PortError>,
     message: String,
     /// Time at which the message was made.
@@ -361,15 +361,15 @@ struct Unavailable {
     failures: u32,
 }
 
-impl Unavailable {
+impl PortUnavailable {
     /// Creates the reason that the port is missing. The `message` stays while it is.
-    fn missing(message: String) -> Unavailable {
-        Unavailable { error: Some(PortError::Missing), message, ..Unavailable::default() }
+    fn missing(message: String) -> PortUnavailable {
+        PortUnavailable { error: Some(PortError::Missing), message, ..PortUnavailable::default() }
     }
 
     /// Creates the reason that the link must not open its port, because another process has its name.
-    fn without_name(failure: Failure) -> Unavailable {
-        Unavailable { message: one_line(failure), ..Unavailable::default() }
+    fn without_name(failure: Failure) -> PortUnavailable {
+        PortUnavailable { message: one_line(failure), ..PortUnavailable::default() }
     }
 
     /// Notes that the port cannot be opened because of `error`. `explain` makes the message.
@@ -417,7 +417,7 @@ mod tests {
     fn message_is_made_once_per_change_of_the_error() {
         let source = Source::Tty("/dev/no-such-port".into());
         let explain = |error: &PortError| one_line(error.explain(&source));
-        let mut reason = Unavailable::missing("it went".to_owned());
+        let mut reason = PortUnavailable::missing("it went".to_owned());
         reason.update(&PortError::Missing, 1, explain);
         assert_eq!((reason.message.as_str(), reason.retry_interval()), ("it went", POLL_INTERVAL));
         reason.update(&PortError::Busy, 2, explain);

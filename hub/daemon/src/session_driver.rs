@@ -620,7 +620,7 @@ mod tests {
             let len = if left > 0 { left.min(1_628) } else { 732 };
             now += if left > 0 { 50_000 } else { 26 * MILLIS };
             left -= left.min(len);
-            // A driver that has just moved its buffers has next to nothing for a moment.
+            // A driver that has just moved its buffers returns few bytes for a moment.
             let (len, left_behind) = if read == 2 && left > 0 { (40, len - 40) } else { (len, 0) };
             left += left_behind;
             if !backlog.take(len, BAUD, now) {

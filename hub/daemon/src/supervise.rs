@@ -1,6 +1,7 @@
 //! The hub as a process: it takes the domain, starts a thread for each link, and then serves signals and requests
 //! until it ends all threads in order.
 
+use std::collections::BTreeMap;
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
@@ -52,6 +53,7 @@ pub(crate) struct ReplaySet<'a> {
 }
 
 /// Outcome of the start of a link.
+#[derive(PartialEq)]
 enum Start {
     /// With an open port, or with a recording.
     Open,
@@ -126,14 +128,15 @@ pub(crate) fn serve(
     check_descriptors(config.links.len())?;
     check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
     // Ends after the links, and writes their last state.
-    let (config, saver) = begin(config, state)?;
+    let (config, saver) = match state {
+        Some(state) => StateSaver::load(config, state, clock::wall_ns())?,
+        None => (config, None),
+    };
     let writer = saver.map(StateWriter::start).transpose()?;
     let config = &config;
     let node = shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
-    let sensors = config.links.iter().map(|link| link.name.clone()).collect();
-    let mut ready = Ready { boot: random(), sensors, waiting: Vec::new(), taken: Vec::new() };
-    let boot = ready.boot;
+    let boot = random();
     // By the port, not by the name: a line that the service manager keeps cannot be opened again.
     service.assign(|line| {
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
@@ -179,32 +182,23 @@ pub(crate) fn serve(
             }
         }
         drop(report);
-        let mut outcome = Ok(());
-        for (number, start) in reports.iter().take(config.links.len()) {
-            let name = &config.links[number].name;
-            match start {
-                Ok(Start::Open) => {}
-                Ok(Start::Waiting) => ready.waiting.push(name.clone()),
-                Ok(Start::Taken) => {
-                    ready.waiting.push(name.clone());
-                    ready.taken.push(name.clone());
-                }
-                Err(failure) => {
-                    outcome = Err(failure);
-                    break;
-                }
-            }
-        }
-        for names in [&mut ready.waiting, &mut ready.taken] {
-            names.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
-        }
-        if outcome.is_ok() {
-            outcome = shm::allocate(domain);
-        }
-        if outcome.is_ok() {
-            outcome = lock.report_ready();
-        }
-        if outcome.is_ok() {
+        // In the order of the links, although they report in any order.
+        let reports = reports.iter().take(config.links.len());
+        let starts: Result<BTreeMap<_, _>, _> =
+            reports.map(|(number, start)| start.map(|start| (number, start))).collect();
+        let outcome = starts.and_then(|starts| {
+            let names = |is_counted: fn(&Start) -> bool| {
+                let counted = starts.iter().filter(|(_, start)| is_counted(start));
+                counted.map(|(&number, _)| config.links[number].name.clone()).collect()
+            };
+            let ready = Ready {
+                boot,
+                sensors: config.links.iter().map(|link| link.name.clone()).collect(),
+                waiting: names(|start| *start != Start::Open),
+                taken: names(|start| *start == Start::Taken),
+            };
+            shm::allocate(domain)?;
+            lock.report_ready()?;
             on_ready(&ready);
             service.ready(&ready.sensors, None);
             player.iter().for_each(|player| player.begin());
@@ -212,26 +206,14 @@ pub(crate) fn serve(
             let watchdog = Watchdog::new(&service, &worked, clock::now());
             let reload = Reload::new(config, read, &service);
             let end_of_playback = player.map(|player| EndOfPlayback { player, holds, ends_at: None });
-            outcome =
-                run_supervisor(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive);
-        }
+            run_supervisor(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive)
+        });
         service.stopping();
         end_links(&stop);
         // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
         outcome.and(ended.map(drop).map_err(|_| broken_thread()))
     })
-}
-
-/// Returns the configuration with the saved state of its links, and the saver of their new state.
-fn begin(
-    config: Config,
-    state: Option<StateDirectory>,
-) -> Result<(Config, Option<StateSaver<StateDirectory>>), Failure> {
-    match state {
-        Some(state) => StateSaver::load(config, state, clock::wall_ns()),
-        None => Ok((config, None)),
-    }
 }
 
 /// Runs `link`, number `number` in the run `boot` of the hub, until the hub ends. A recording is played as `part` of

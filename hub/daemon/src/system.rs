@@ -124,20 +124,14 @@ impl<'a> System<'a> {
         let now = clock::now();
         self.polled_at.set(now);
         let span = clock::span(now, until);
-        let [stop, requests] =
-            [self.hub.stop.as_fd(), requests.as_fd()].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
-        let woken = match port {
-            Some((port, events)) => {
-                let mut fds = [stop, requests, PollFd::from_borrowed_fd(port, events)];
-                poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(is_ready))
-            }
-            None => {
-                let mut fds = [stop, requests];
-                poll(&mut fds, Some(&span)).map(|_| [is_ready(&fds[0]), is_ready(&fds[1]), false])
-            }
-        };
+        let stop = self.hub.stop.as_fd();
+        // Without a port, a second entry for `stop` that waits for nothing.
+        let (port, events) = port.unwrap_or((stop, PollFlags::empty()));
+        let mut fds = [(stop, PollFlags::IN), (requests.as_fd(), PollFlags::IN), (port, events)]
+            .map(|(fd, events)| PollFd::from_borrowed_fd(fd, events));
+        let ready = poll(&mut fds, Some(&span)).map(|_| fds.each_ref().map(|fd| !fd.revents().is_empty()));
         self.worked.store(true, Ordering::Relaxed);
-        match woken {
+        match ready {
             Ok([true, ..]) => WakeReason::Stop,
             Ok([_, true, _]) => WakeReason::Request,
             Ok([.., true]) => WakeReason::Ready,
@@ -331,10 +325,6 @@ impl Line for Port {
     fn is_simulated(&self) -> bool {
         self.simulated()
     }
-}
-
-fn is_ready(fd: &PollFd<'_>) -> bool {
-    !fd.revents().is_empty()
 }
 
 /// Maximum wait that is slept through.
