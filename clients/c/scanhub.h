@@ -329,7 +329,7 @@ static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_dat
     return SCANHUB_OK;
 }
 
-/* Whether numbers of `size` bytes from `at` on are neither infinite nor NaN. */
+/* Returns whether `count` numbers of `size` bytes, from `at` on, are neither infinite nor NaN. */
 static inline int scanhub_are_finite(const uint8_t *at, size_t size, size_t count)
 {
     for (; count > 0; count--, at += size)
@@ -587,8 +587,8 @@ struct scanhub_background {
     uint16_t taught; /* Number of beams whose background is known. */
     uint16_t count; /* Number of beams of the model; 0 before the first scan. */
     uint8_t frozen; /* 1: Learning is stopped. */
-    /* Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the sensor's maximum range. Each
-     * has 2 bytes. */
+    /* Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the maximum range. Each has 2
+     * bytes. */
     const uint8_t *ranges;
 };
 static inline enum scanhub_result scanhub_read_background(const struct scanhub_datagram *datagram,
@@ -1130,29 +1130,29 @@ static inline enum scanhub_result scanhub_read_obstacles(const struct scanhub_da
 }
 /* End of payloads. */
 
-/* The range of beam i in device units, i below `count`, as here everywhere: what is above `valid_to` is no range. */
+/* Returns the range of beam i in device units. Values above `valid_to` are codes. Here and below, i is below `count`. */
 static inline uint16_t scanhub_scan_range(const struct scanhub_scan *scan, unsigned i)
 {
     return scanhub_u16(scan->ranges + 2 * (size_t)i);
 }
-/* The range of beam i in metres; NAN if it has no reading, whatever the reason. */
+/* Returns the range of beam i in meters; NAN if it has no reading. */
 static inline double scanhub_scan_m(const struct scanhub_scan *scan, unsigned i)
 {
     uint16_t range = scanhub_scan_range(scan, i);
     return range <= scan->valid_to ? (double)range * scan->unit_um / 1e6 : NAN;
 }
-/* The angle of beam i in radians, exact where the sensor says so. */
+/* Returns the angle of beam i in radians: the exact one if the scan has it, otherwise that of the grid. */
 static inline double scanhub_scan_angle(const struct scanhub_scan *scan, unsigned i)
 {
     double exact = scan->angles ? (double)scanhub_f32(scan->angles + 4 * (size_t)i) : NAN;
     return isnan(exact) ? scan->first_angle + i * scan->step : exact;
 }
-/* Why beam i has no reading; NULL if it has one. */
+/* Returns the reason why beam i has no reading; NULL if it has one. */
 static inline const char *scanhub_scan_code(const struct scanhub_scan *scan, unsigned i)
 {
     static const char *const words[8] = {
         "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error"};
-    /* Those of an LMS, from the greatest value of its measuring mode down. */
+    /* Codes of an LMS, from the highest value of its measuring mode down. */
     static const uint8_t lms[9] = {1, 4, 6, 6, 5, 7, 6, 6, 2};
     unsigned range = scanhub_scan_range(scan, i), greatest = scan->no_return;
     if (range <= scan->valid_to)
@@ -1168,7 +1168,7 @@ static inline int32_t scanhub_scan_intensity(const struct scanhub_scan *scan, un
         return -1;
     return scan->wide ? scanhub_u16(scan->wide + 2 * (size_t)i) : scan->upper ? scan->upper[i] : -1;
 }
-/* When beam i was measured, in ns after the datagram's stamp. */
+/* Returns the time at which beam i was measured, in ns after the datagram's stamp. */
 static inline int64_t scanhub_scan_beam_ns(const struct scanhub_scan *scan, unsigned i)
 {
     int64_t turn = i % (scan->turns ? scan->turns : 1u);

@@ -54,7 +54,7 @@ EVENTS = ("appeared", "left", "door")
 POINT_CLASSES = ("unknown", "background", "foreground", "behind")
 # End of constants.
 CODES = ("not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error")
-"""Why a beam has no reading, from the greatest value down; those of an LMS count from that of its measuring mode."""
+"""Reasons why a beam has no reading, from the highest value down."""
 _OF_LMS = {0: "no_return", 1: "too_bright", 4: "weak", 5: "error", 8: "beyond"}
 AUTHENTICATED, SIMULATED, REPLAYED, STAMP_ESTIMATED, SUSPECT = 1, 2, 4, 8, 16
 """Bits of `Datagram.flags`."""
@@ -223,7 +223,7 @@ class Segment:
     y_mm: int
     """Mean of the points in the robot's frame: mm to the left of the center."""
     support: bool
-    """Whether it is supported: it has several beams, or the foreground of the previous scan was near it."""
+    """Whether it has several beams, or the foreground of the previous scan was near it."""
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class Background:
     frozen: bool
     """Learning is stopped."""
     ranges: "tuple[int, ...]"
-    """Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the sensor's maximum range."""
+    """Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the maximum range."""
 
 
 @dataclass(frozen=True)
@@ -612,16 +612,16 @@ class Scan(_ScanHead):
         return [value * self.unit_um / 1e6 if value <= self.valid_to else None for value in self.ranges]
 
     def angles(self) -> "list[float]":
-        """Where each beam looks, exact where the sensor says so."""
+        """The angle of each beam in radians: the exact one if the scan has it, otherwise that of the grid."""
         grid = [self.first_angle + i * self.step for i in range(self.count)]
         return [known if angle != angle else angle for known, angle in zip(grid, self.exact)] if self.exact else grid
 
     def codes(self) -> "list[Optional[str]]":
-        """Why each beam has no reading, None where it has one."""
+        """The reason why each beam has no reading, None if it has one."""
         return [self._code(value) if value > self.valid_to else None for value in self.ranges]
 
     def times_ns(self) -> "list[int]":
-        """When each beam was measured, in ns after the datagram's stamp."""
+        """The time at which each beam was measured, in ns after the datagram's stamp."""
         step, turns = self.beam_time_ns, max(self.turns, 1)
         return [self.first_beam_ns + i * step + i % turns * self.turn_ns for i in range(self.count)]
 

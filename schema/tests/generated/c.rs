@@ -59,7 +59,7 @@ fn prefix(set: &str) -> String {
     format!("SCANHUB_{}_", name.to_uppercase())
 }
 
-/// Returns the set with whose constants a set is written, if that is another one.
+/// Returns the set that already has constants for the values of this one, if there is one.
 fn shared(set: &str) -> Option<&'static str> {
     (set == "Obstacles").then_some("Cloud")
 }
@@ -166,7 +166,7 @@ pub(crate) fn commented(line: &str, comment: &str) -> String {
 
 /// Returns a comment in lines of its own.
 pub(crate) fn above(indent: &str, comment: &str) -> String {
-    // The end of the comment stays on the line of the last word.
+    // Keep the end of the comment on the same line as its text.
     let lines = wrap(&format!("{indent}/* "), &format!("{indent} * "), &format!("{comment}\u{1}*/"), WIDTH);
     lines.replace('\u{1}', " ")
 }

@@ -246,7 +246,8 @@ fn statements(description: &Description, layout: &Layout, out: &str) -> String {
             (How::Computed(_), _) => {
                 let method = field_number(layout, "method", "at");
                 format!(
-                    "{name} = {method} <= SCANHUB_MOTION_BOTH && {method} != SCANHUB_MOTION_REFUSED && !({value} & 2);"
+                    "{name} = {method} <= SCANHUB_MOTION_BOTH && {method} != SCANHUB_MOTION_REFUSED \
+                     && !({value} & 2);"
                 )
             }
             (_, Kind::Text) => {
@@ -290,9 +291,9 @@ fn accessor(
     let count = array.count.trim_start_matches("out->");
     write!(
         text,
-        "}};\n/* Returns element i of `{0}`, i below `{count}`. */\nstatic inline struct scanhub_{name} \
-         scanhub_{name}(const struct scanhub_{payload} *{payload}, unsigned i)\n{{\n    const uint8_t *at = {payload}->{0} \
-         + {1} * (size_t)i;\n    struct scanhub_{name} out;\n",
+        "}};\n/* Returns element i of `{0}`, i below `{count}`. */\n\
+         static inline struct scanhub_{name} scanhub_{name}(const struct scanhub_{payload} *{payload}, unsigned i)\n\
+         {{\n    const uint8_t *at = {payload}->{0} + {1} * (size_t)i;\n    struct scanhub_{name} out;\n",
         array.name, array.size
     )
     .expect("a String");
@@ -344,9 +345,10 @@ fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Ar
     let first = rules::first_revision(&layout.name);
     let function = if layout.name == "Foreground" { "foreground_arrays" } else { name };
     let mut text = format!(
-        "static inline enum scanhub_result scanhub_read_{function}(const struct scanhub_datagram *datagram,\n    struct \
-         scanhub_{name} *out)\n{{\n    const uint8_t *at = datagram->payload;\n    enum scanhub_result result = \
-         scanhub_expect(datagram, SCANHUB_{}, {});\n",
+        "static inline enum scanhub_result scanhub_read_{function}(const struct scanhub_datagram *datagram,\n    \
+         struct scanhub_{name} *out)\n\
+         {{\n    const uint8_t *at = datagram->payload;\n    \
+         enum scanhub_result result = scanhub_expect(datagram, SCANHUB_{}, {});\n",
         name.to_uppercase(),
         first.unwrap_or(head.size)
     );
@@ -373,8 +375,8 @@ fn reader(description: &Description, topic: Topic, layout: &Layout, arrays: &[Ar
         if !conditions.is_empty() {
             write!(
                 loops,
-                "    for (i = 0; i < {}; i++) {{\n        at = out->{} + {} * (size_t)i;\n        if ({})\n            return \
-                 SCANHUB_BAD_PAYLOAD;\n    }}\n",
+                "    for (i = 0; i < {}; i++) {{\n        at = out->{} + {} * (size_t)i;\n        \
+                 if ({})\n            return SCANHUB_BAD_PAYLOAD;\n    }}\n",
                 array.count,
                 array.name,
                 array.size,

@@ -1,5 +1,5 @@
-//! The description of all layouts, read from the sources of this crate: every struct of a payload with its fields, their
-//! types and doc comments, and the constants and enums that the comments link to.
+//! The description of all layouts, read from the sources of this crate: every struct of a payload with its fields,
+//! their types and comments, and the constants and enums that the comments link to.
 //!
 //! Offsets are sums of sizes. That is exact, because every one of these structs derives `Pod`, which rejects padding.
 
@@ -93,7 +93,7 @@ impl Field {
         self.doc.replace(VALUES, values)
     }
 
-    /// Size in bytes.
+    /// Returns the size in bytes.
     pub(crate) fn size(&self) -> usize {
         self.element * self.len.unwrap_or(1)
     }
@@ -218,7 +218,7 @@ impl Description {
 #[derive(Default)]
 struct Sources {
     structs: BTreeMap<String, syn::ItemStruct>,
-    enums: BTreeMap<String, (String, Vec<Value2>)>,
+    enums: BTreeMap<String, (String, Vec<NumberNameDoc>)>,
     /// By `Type::NAME`, or `NAME` outside of a type: number and comment.
     consts: BTreeMap<String, (u64, String)>,
     /// In the order of the source.
@@ -226,7 +226,7 @@ struct Sources {
 }
 
 /// Number, name and comment.
-type Value2 = (u64, String, String);
+type NumberNameDoc = (u64, String, String);
 
 impl Sources {
     fn read_folder(&mut self, folder: &Path) {
@@ -321,8 +321,8 @@ impl Sources {
         }
     }
 
-    /// Returns `doc` without links, and the set that it links to. A link to an enum or to flags stands for their values,
-    /// a link to another constant for its number. A sentence with a link to a function is left out.
+    /// Returns `doc` without links, and the set that it links to. A link to an enum or to flags stands for their
+    /// values, a link to another constant for its number. A sentence with a link to a function is left out.
     fn resolve(&self, rust: &str, item: &syn::ItemStruct, doc: &str) -> (String, Option<String>) {
         let mut set = None;
         let mut kept = Vec::new();
@@ -486,7 +486,7 @@ pub(crate) fn upper_first(text: &str) -> String {
     letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }
 
-/// Returns the text with its first letter in lower case, unless the first word is an abbreviation.
+/// Returns the text with its first letter in lower case, unless it starts with an abbreviation.
 pub(crate) fn lower_first(text: &str) -> String {
     let mut letters = text.chars();
     let first = letters.next();

@@ -306,7 +306,8 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
                 // Method 1 is `refused`, and flag 2 is `open`.
                 let method = number(field(layout, "method"), base);
                 format!(
-                    "    local method = {method}\n    local is_valid = METHODS[method] and method ~= 1 and {} % 4 < 2\n    \
+                    "    local method = {method}\n    \
+                     local is_valid = METHODS[method] and method ~= 1 and {} % 4 < 2\n    \
                      tree:add(f[\"{name}\"], payload({at}, {len}), is_valid and 1 or 0)",
                     number(shown_field, base)
                 )
@@ -326,14 +327,15 @@ fn additions(description: &Description, topic: Topic, layout: &Layout, base: &st
                 }
             }
             _ if shown_field.set.as_deref() == Some("Counter") => format!(
-                "    for i, name in ipairs(COUNTERS) do\n        tree:add_le(f[\"{}.\" .. name], payload({} + {len} * i, \
-                 {len}))\n    end",
+                "    for i, name in ipairs(COUNTERS) do\n        \
+                 tree:add_le(f[\"{}.\" .. name], payload({} + {len} * i, {len}))\n    end",
                 topic.name(),
                 offset(base, shown_field.at - len)
             ),
             _ => match shown_field.len {
                 Some(count) => format!(
-                    "    for i = 0, {} do\n        tree:add_le(f[\"{name}\"], payload({at} + {len} * i, {len}))\n    end",
+                    "    for i = 0, {} do\n        \
+                     tree:add_le(f[\"{name}\"], payload({at} + {len} * i, {len}))\n    end",
                     count - 1
                 ),
                 None => format!("    tree:add_le(f[\"{name}\"], payload({at}, {len}))"),
@@ -427,8 +429,8 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
     text
 }
 
-/// Returns the lines that return the text for the column "Info": the name of a value, numbers of elements, and the flags that
-/// are set.
+/// Returns the lines that return the text for the column "Info": the name of a value, numbers of elements, and the
+/// flags that are set.
 fn summary(description: &Description, layout: &Layout, arrays: &[(&str, &str)]) -> String {
     let mut parts = Vec::new();
     let values = layout.fields[..rules::head(layout).fields].iter();

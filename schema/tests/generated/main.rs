@@ -1,6 +1,17 @@
 //! Generates the layouts of all payloads for other languages from the Rust structs, and checks that the committed files
 //! are up to date. After a change of a struct, `SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated` writes
 //! them.
+//!
+//! The generator reads names, types and comments of the fields. These conventions carry the rest:
+//!
+//! - `X_text` is UTF-8, padded with 0. `reserved` is 0, and readers do not show it.
+//! - The used elements of `X_array` are counted by the field `Xs` if it exists, and otherwise by `count`.
+//! - A comment that links to an enum, or to a type that only has constants, lists their values. A link to constants
+//!   whose comments start with "Flag" lists the flags; the field is called `flags`.
+//! - A link to another constant becomes its value. A sentence with a link to a function is left out.
+//!
+//! `rules` and `readers` have what the structs do not say: arrays whose length depends on counts, names that differ
+//! between languages, and conditions of a valid payload.
 
 mod c;
 mod datagram_c;

@@ -10,7 +10,8 @@ use super::{rules, wrap};
 
 const WIDTH: usize = 120;
 
-/// Payloads whose readers are written by hand, because their arrays depend on each other. Only their heads are generated.
+/// Payloads whose readers are written by hand, because their arrays depend on each other. Only their heads are
+/// generated.
 const HEADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Order of fields in the dataclasses where it is not that of the memory. Other fields follow.
@@ -110,7 +111,7 @@ fn tuple(name: &str, values: impl Iterator<Item = String>) -> String {
     format!("{name} = (\n{})\n", wrap("    ", "    ", &format!("{},", values.join(", ")), WIDTH))
 }
 
-/// Returns the classes of all payloads and of the elements of their arrays.
+/// Returns the classes of all payloads and array elements.
 pub(crate) fn classes(description: &Description) -> String {
     let mut text = String::new();
     for layout in layouts(description) {
@@ -134,7 +135,7 @@ fn members(description: &Description, layout: &Layout) -> Vec<(String, String, S
         members.push((shown.name.clone(), kind(layout, &shown), comment(description, &shown)));
     }
     if layout.name == "Segment" {
-        let doc = "Whether it is supported: it has several beams, or the foreground of the previous scan was near it.";
+        let doc = "Whether it has several beams, or the foreground of the previous scan was near it.";
         members.push(("support".to_owned(), "bool".to_owned(), doc.to_owned()));
     }
     let mut arrays: Vec<_> = layout.fields[rules::head(layout).fields..].iter().collect();
@@ -218,7 +219,7 @@ fn comment(description: &Description, shown: &Shown) -> String {
                 let none =
                     if kind_is_optional(set) { " None if this version does not have the value." } else { "" };
                 let doc = field.doc(&format!("one of {}", names_of(set)));
-                // What readers in this language need not do.
+                // The reader already does it.
                 let doc = doc.split(" Treat ").next().unwrap_or_default();
                 format!("{doc}{none}")
             }

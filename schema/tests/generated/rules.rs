@@ -47,7 +47,7 @@ const BACKGROUND: [Tail; 1] = [array(
     "ranges",
     "u16",
     "count",
-    "Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the sensor's maximum range.",
+    "Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the maximum range.",
 )];
 const CLOUD: [Tail; 1] = [array("points", "CloudPoint", "count", "The points.")];
 
