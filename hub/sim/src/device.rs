@@ -40,13 +40,19 @@ pub trait Device {
     fn streams(&self) -> bool;
 
     /// Returns the length of a telegram, if all have the same. Otherwise each telegram contains its length.
-    fn telegram_len(&self) -> Option<usize>;
+    fn telegram_len(&self) -> Option<usize> {
+        None
+    }
 
     /// Returns the last request that the scanner dropped because of its gaps. Returns it once.
-    fn take_dropped(&mut self) -> Option<Dropped>;
+    fn take_dropped(&mut self) -> Option<Dropped> {
+        None
+    }
 
     /// Returns the number of requests that would change the permanent settings, carried out or refused.
-    fn eeprom_writes(&self) -> u64;
+    fn eeprom_writes(&self) -> u64 {
+        0
+    }
 }
 
 /// Bytes that the host's hardware delivers at once.

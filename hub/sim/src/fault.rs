@@ -364,7 +364,7 @@ impl Noise {
 }
 
 /// Returns whether an event with the probability `share` happens. Draws no number if `share` is 0.
-pub(super) fn happens(random: &mut fastrand::Rng, share: f64) -> bool {
+fn happens(random: &mut fastrand::Rng, share: f64) -> bool {
     share > 0.0 && random.f64() < share
 }
 

@@ -12,7 +12,7 @@ use schema::{Failure, Family, Kind, MILLIS, Nanos};
 use crate::device::ChunkSize;
 use crate::device::TxQueue;
 use crate::device::{Chunk, Device};
-use crate::request_decoder::{Arrival, Dropped};
+use crate::request_decoder::Arrival;
 use crate::room::Room;
 use crate::rotating::{Beams, Rotation, ahead_deg};
 
@@ -243,14 +243,6 @@ impl Device for LdSimulator {
 
     fn telegram_len(&self) -> Option<usize> {
         Some(LEN)
-    }
-
-    fn take_dropped(&mut self) -> Option<Dropped> {
-        None
-    }
-
-    fn eeprom_writes(&self) -> u64 {
-        0
     }
 }
 

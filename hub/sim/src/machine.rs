@@ -615,10 +615,6 @@ impl Device for LmsSimulator {
     fn streams(&self) -> bool {
         self.operating.streams()
     }
-
-    fn telegram_len(&self) -> Option<usize> {
-        None
-    }
 }
 
 fn answer(reply: &Encoded, delay_ns: Nanos) -> Answer {

@@ -1,5 +1,5 @@
-//! What a sensor is tilted by: how it is turned at each moment, and what its encoder says of it, which may be wrong. A
-//! pure function of time. Knows no beams.
+//! A mount that tilts a sensor: its angle at each time, and the reports of its encoder, which may have faults. Both are pure
+//! functions of time.
 
 use std::cmp::Reverse;
 use std::f64::consts::PI;
@@ -9,112 +9,113 @@ use schema::Nanos;
 use crate::shape::Plane;
 use crate::shape::Point;
 
-/// A mount whose axis lies across, and that swings evenly to and fro. Angles grow as it looks down.
+/// A mount with a horizontal axis across the view, which swings to and fro at a constant speed. Greater angles look farther
+/// down.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mount {
-    /// Of the axis above the floor.
+    /// Height of the axis above the floor.
     pub height_mm: f64,
-    /// From the axis to the sensor while it is level: ahead, and up.
+    /// Position of the sensor relative to the axis at angle 0: ahead, and up.
     pub arm_mm: (f64, f64),
-    /// Where it begins, and turns back.
+    /// Angle at the start and at one reversal.
     pub from_deg: f64,
-    /// Where it turns, the greater angle.
+    /// Angle at the other reversal, which is greater.
     pub to_deg: f64,
-    /// How fast.
+    /// Speed in degrees per second.
     pub deg_s: f64,
-    /// How often the encoder says where it is.
+    /// Reports of the encoder per second.
     pub reports_hz: f64,
-    /// What goes wrong with what it says, or with the motor.
+    /// Faults of the encoder or the motor.
     pub faults: Vec<Fault>,
 }
 
-/// Something goes wrong from one time to another.
+/// A fault of a mount, with its time span.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fault {
-    /// What.
+    /// Kind of the fault.
     pub kind: FaultKind,
-    /// Seconds since the sensor's start.
+    /// Start in seconds since the start of the sensor.
     pub from_s: f64,
-    /// The end of it.
+    /// End in seconds since the start of the sensor.
     pub until_s: f64,
 }
 
-/// What goes wrong.
+/// Kind of a fault.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FaultKind {
-    /// The motor stands, and the encoder says so. Afterwards it goes on from there.
+    /// The motor stops, and the encoder reports it. Afterwards the motion continues.
     Halts,
-    /// The encoder says nothing.
+    /// The encoder sends no reports.
     Silent,
-    /// The encoder says the same angle all the time, while the mount swings.
+    /// The encoder reports a constant angle, while the mount swings.
     Stuck,
-    /// The encoder is off by so many degrees, from one moment to the next.
+    /// The encoder is suddenly off by this number of degrees.
     Jumps(f64),
-    /// The encoder gets off by so many degrees, at 2 degrees a second, and back.
+    /// The error of the encoder grows to this number of degrees at 2 degrees per second, and shrinks again.
     Lies(f64),
-    /// What the encoder says comes so many seconds later, with the right time in it.
+    /// Reports arrive this number of seconds later, with correct stamps.
     Late(f64),
     /// The stamps are this many seconds later than the angles; earlier if negative.
     StampsLate(f64),
 }
 
-/// What the encoder says.
+/// A report of the encoder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Report {
-    /// When that was so.
+    /// Time of the angle.
     pub stamp_ns: Nanos,
-    /// When it arrives.
+    /// Time at which the report arrives.
     pub arrives_ns: Nanos,
-    /// In radians.
+    /// Angle in radians.
     pub angle_rad: f64,
-    /// How fast it grows, in radians a second.
+    /// Change of the angle in radians per second.
     pub rate_rad_s: f64,
 }
 
-/// What an encoder says, as it says it.
+/// Encoder of a mount, which sends reports.
 #[derive(Clone, Debug)]
 pub(crate) struct Encoder {
     mount: Mount,
-    /// The next report that is made.
+    /// Number of the next report.
     number: u64,
-    /// Those that are made, and have not arrived; the latest first.
-    on_their_way: Vec<Report>,
+    /// Reports that were sent and have not arrived. The last one arrives first.
+    pending: Vec<Report>,
 }
 
 impl Encoder {
-    /// That of `mount`.
+    /// Creates the encoder of `mount`.
     pub(crate) fn new(mount: Mount) -> Encoder {
-        Encoder { mount, number: 0, on_their_way: Vec::new() }
+        Encoder { mount, number: 0, pending: Vec::new() }
     }
 
-    /// The next report that has arrived at `now_ns`.
+    /// Returns the next report that has arrived at `now_ns`.
     pub(crate) fn poll(&mut self, now_ns: Nanos) -> Option<Report> {
-        while self.made_ns() <= now_ns {
-            self.on_their_way.extend(self.mount.report(self.number));
-            self.on_their_way.sort_by_key(|report| Reverse(report.arrives_ns));
+        while self.next_report_ns() <= now_ns {
+            self.pending.extend(self.mount.report(self.number));
+            self.pending.sort_by_key(|report| Reverse(report.arrives_ns));
             self.number += 1;
         }
-        self.on_their_way.pop_if(|report| report.arrives_ns <= now_ns)
+        self.pending.pop_if(|report| report.arrives_ns <= now_ns)
     }
 
-    /// When to ask again.
+    /// Returns the time of the next poll.
     pub(crate) fn poll_timeout(&self) -> Nanos {
-        let arrives_ns = self.on_their_way.last().map_or(Nanos::MAX, |report| report.arrives_ns);
-        arrives_ns.min(self.made_ns())
+        let arrives_ns = self.pending.last().map_or(Nanos::MAX, |report| report.arrives_ns);
+        arrives_ns.min(self.next_report_ns())
     }
 
-    fn made_ns(&self) -> Nanos {
+    fn next_report_ns(&self) -> Nanos {
         (self.number as f64 / self.mount.reports_hz * 1e9).round() as Nanos
     }
 }
 
 impl Mount {
-    /// How the sensor is turned at `time_ns`, in radians.
+    /// Returns the angle of the sensor at `time_ns` in radians.
     pub fn angle_rad(&self, time_ns: Nanos) -> f64 {
         self.angle_deg(time_ns as f64 / 1e9).to_radians()
     }
 
-    /// What the encoder says for the `number`th time, if it says anything.
+    /// Returns report number `number`; `None` while the encoder is silent.
     pub fn report(&self, number: u64) -> Option<Report> {
         let time_s = number as f64 / self.reports_hz;
         let mut at_s = time_s;
@@ -139,14 +140,14 @@ impl Mount {
         let nanos = |time_s: f64| (time_s * 1e9).round() as Nanos;
         Some(Report {
             stamp_ns: nanos(stamp_s),
-            // A program that stamps an angle when it arrives stamps it late.
+            // A program that stamps an angle at its arrival stamps it late.
             arrives_ns: nanos(stamp_s.max(time_s) + late_s),
             angle_rad: (self.angle_deg(at_s) + off_deg).to_radians(),
             rate_rad_s: rate_deg_s / 180.0 * PI,
         })
     }
 
-    /// The plane that the sensor measures in at `time_ns`.
+    /// Returns the plane in which the sensor measures at `time_ns`.
     pub(crate) fn plane(&self, time_ns: Nanos) -> Plane {
         let down_deg = self.angle_deg(time_ns as f64 / 1e9);
         let (sin, cos) = down_deg.to_radians().sin_cos();
@@ -156,17 +157,17 @@ impl Mount {
     }
 
     fn angle_deg(&self, time_s: f64) -> f64 {
-        let way = self.way(time_s);
+        let travel_deg = self.travel_deg(time_s);
         let width = self.to_deg - self.from_deg;
-        self.from_deg + if way <= width { way } else { 2.0 * width - way }
+        self.from_deg + if travel_deg <= width { travel_deg } else { 2.0 * width - travel_deg }
     }
 
     fn direction(&self, time_s: f64) -> f64 {
-        if self.way(time_s) < self.to_deg - self.from_deg { 1.0 } else { -1.0 }
+        if self.travel_deg(time_s) < self.to_deg - self.from_deg { 1.0 } else { -1.0 }
     }
 
-    /// Degrees since it was at its beginning last.
-    fn way(&self, time_s: f64) -> f64 {
+    /// Returns the degrees since the mount was at `from_deg` last.
+    fn travel_deg(&self, time_s: f64) -> f64 {
         let stood = self.faults.iter().filter(|fault| fault.kind == FaultKind::Halts);
         let stood_s: f64 = stood.map(|fault| (time_s.min(fault.until_s) - fault.from_s).max(0.0)).sum();
         (self.deg_s * (time_s - stood_s)).rem_euclid(2.0 * (self.to_deg - self.from_deg))
@@ -183,7 +184,7 @@ impl Fault {
     }
 }
 
-/// How fast a lie grows: no step of it can be told from the mount's own.
+/// Speed at which the error of [`FaultKind::Lies`] grows, in degrees per second. No step of it differs from the mount's motion.
 const LIE_DEG_S: f64 = 2.0;
 
 #[cfg(test)]

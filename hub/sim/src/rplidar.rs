@@ -17,7 +17,7 @@ use crate::device::{Chunk, Device};
 use crate::device::{ChunkSize, TxQueue};
 use crate::fault::{Faults, Window};
 use crate::machine::ProtocolQuirks;
-use crate::request_decoder::{Arrival, Dropped};
+use crate::request_decoder::Arrival;
 use crate::room::Room;
 use crate::rotating::{BeamReading, Beams, Rotation, TruePoint, ahead_deg};
 use protocol::{Decoder, Motor, Reading, Request};
@@ -409,10 +409,6 @@ impl Device for RplidarSimulator {
 
     fn telegram_len(&self) -> Option<usize> {
         Some(self.stream?.mode.form.packet_len())
-    }
-
-    fn take_dropped(&mut self) -> Option<Dropped> {
-        None
     }
 
     fn eeprom_writes(&self) -> u64 {

@@ -108,9 +108,9 @@ impl Shape {
 /// Position and rotation of an object in a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pose {
-    /// To the right, in millimetres.
+    /// To the right, in millimeters.
     pub(crate) x_mm: f64,
-    /// Ahead, in millimetres.
+    /// Ahead, in millimeters.
     pub(crate) y_mm: f64,
     /// Counterclockwise, in degrees.
     pub(crate) turn_deg: f64,

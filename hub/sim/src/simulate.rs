@@ -43,34 +43,34 @@ pub struct Ready {
 }
 
 /// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. `on_ready` is called
-/// once all ports exist, and `tell` with each telegram from the thread of the port. The symlinks are removed when this
+/// once all ports exist, and `on_record` with each telegram from the thread of the port. The symlinks are removed when this
 /// function returns.
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,
     on_ready: impl FnOnce(&[Ready]),
-    tell: impl Fn(&Record) + Sync,
+    on_record: impl Fn(&Record) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
-    simulate_with(options, stop, on_ready, tell, |_| None, |_, _| {})
+    simulate_with(options, stop, on_ready, on_record, |_| None, |_, _| {})
 }
 
 /// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns an event for this port.
-/// `say` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
+/// `on_report` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
     on_ready: impl FnOnce(&[Ready]),
-    tell: impl Fn(&Record) + Sync,
+    on_record: impl Fn(&Record) + Sync,
     event: impl Fn(&Path) -> Option<Event> + Sync,
-    say: impl Fn(usize, Report) + Sync,
+    on_report: impl Fn(usize, Report) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
     options.check()?;
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
     // The ports are LMS, so the bytes of a stream file belong to an LMS.
     let recording = recording.map(|path| Recording::open_as(path, Some(Family::Lms))).transpose()?;
     let truth = options.truth.as_deref().map(|path| Truth::create(path, options.force)).transpose()?;
-    let tell = |record: &Record| {
-        tell(record);
+    let on_record = |record: &Record| {
+        on_record(record);
         truth.as_ref().map_or(Ok(()), |truth| truth.write(&record.line()))
     };
     let mut ready = Vec::new();
@@ -92,10 +92,10 @@ pub fn simulate_with(
             machine,
             wire,
             time,
-            tell: &tell,
+            on_record: &on_record,
             event: &event,
             encoder,
-            say: &say,
+            on_report: &on_report,
             lossless: options.lossless,
             is_open: false,
             fault: None,
@@ -149,19 +149,22 @@ fn device(
     let room = || Room::of_port(&options.world, options.seed, number as u64);
     let (chunk, boot_ns) = (options.chunk, options.boot.as_nanos() as Nanos);
     let seed = options.seed.wrapping_add(number as u64);
+    let sensor = options.sensors.get(number).or(options.sensors.last()).map(String::as_str);
     Ok(match options.scanner {
         None => {
-            let chosen = chosen(options, recording, number)?;
+            let chosen = match (recording, sensor) {
+                (Some(recording), Some(sensor)) => Some(recording.of(sensor)?),
+                (recording, _) => recording.cloned(),
+            };
             if let Some(other) = chosen.as_ref().filter(|chosen| !chosen.contents().is_lms()) {
                 let message = format!("{} is not of an LMS, which is simulated", other.path().display());
                 let hint = "--family says of which scanner it is";
                 return Err(Failure::new(Kind::Input, message, hint));
             }
-            let (settings, source) = sensor(options, chosen.as_ref(), number)?;
+            let (settings, source) = lms(options, chosen.as_ref(), seed, room)?;
             Box::new(LmsSimulator::new(settings, source))
         }
         Some(Scanner::Ld(model)) => {
-            let sensor = options.sensors.get(number).or(options.sensors.last()).map(String::as_str);
             let packets = match &options.replay {
                 Some(path) => Packets::Recorded { packets: recorded(path, sensor)?, looped: options.looped },
                 None => Packets::Room(Box::new(room())),
@@ -192,26 +195,14 @@ fn device(
     })
 }
 
-/// Returns the recording that the port with this number plays: the part of the sensor that was named for it.
-fn chosen(
-    options: &SimulateOptions,
-    recording: Option<&Recording>,
-    number: usize,
-) -> Result<Option<Recording>, Failure> {
-    let sensor = options.sensors.get(number).or(options.sensors.last());
-    let chosen =
-        recording.map(|recording| sensor.map_or(Ok(recording.clone()), |sensor| recording.of(sensor)));
-    chosen.transpose()
-}
-
 /// Returns the settings of an LMS from the flags, or else from the recording, or else of the factory, and its measured
 /// values.
-fn sensor(
+fn lms(
     options: &SimulateOptions,
     recording: Option<&Recording>,
-    number: usize,
+    seed: u64,
+    room: impl FnOnce() -> Room,
 ) -> Result<(Settings, Source), Failure> {
-    let seed = options.seed.wrapping_add(number as u64);
     let contents = recording.map(Recording::contents);
     let factory = options.family.factory_variant().unwrap_or(Variant::HALF);
     let variant = options.variant.or(contents.and_then(|c| c.variant)).unwrap_or(factory);
@@ -238,7 +229,7 @@ fn sensor(
         seed,
     };
     let source = match recording {
-        None => Source::Room(Room::of_port(&options.world, options.seed, number as u64)),
+        None => Source::Room(room()),
         Some(recording) => {
             let telegrams = scans(recording, Encoding { unit, mode }, options.looped)?;
             Source::Recorded { variant, telegrams }
@@ -286,13 +277,13 @@ struct PortThread<'a> {
     pub(crate) wire: LineModel,
     pub(crate) time: Time,
     /// Receives each telegram that was sent.
-    pub(crate) tell: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
+    pub(crate) on_record: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
     /// Returns the next event for this port.
     pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
     /// Encoder of its mount, if it has one.
     pub(crate) encoder: Option<Encoder>,
     /// Receives the reports of the encoder, in time of the clock.
-    say: &'a (dyn Fn(usize, Report) + Sync),
+    on_report: &'a (dyn Fn(usize, Report) + Sync),
     /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that no program reads.
     pub(crate) lossless: bool,
     /// Whether a host has the port open.
@@ -355,7 +346,7 @@ impl PortThread<'_> {
                 let [stamp_ns, arrives_ns] =
                     [report.stamp_ns, report.arrives_ns].map(|at| self.time.of_clock(at));
                 let rate_rad_s = report.rate_rad_s * self.time.speed;
-                (self.say)(self.number, Report { stamp_ns, arrives_ns, rate_rad_s, ..report });
+                (self.on_report)(self.number, Report { stamp_ns, arrives_ns, rate_rad_s, ..report });
             }
             while let Some(delivery) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
                 self.hand_over(delivery)?;
@@ -483,7 +474,7 @@ impl PortThread<'_> {
             self.fault = self.fault.or(fault);
         }
         if let Some(Part::End(sent)) = part {
-            (self.tell)(&Record {
+            (self.on_record)(&Record {
                 port: self.port.clone(),
                 index: self.sent,
                 is_reply: sent.is_reply,

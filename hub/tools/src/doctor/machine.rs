@@ -372,7 +372,10 @@ const LOOPBACK: u32 = 0x8;
 const MULTICAST: u32 = 0x1000;
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(super) use tests::{facts, says};
+
+#[cfg(test)]
+mod tests {
     use schema::Kind;
 
     use super::*;

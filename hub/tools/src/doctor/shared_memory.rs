@@ -220,7 +220,7 @@ mod tests {
 
     use super::*;
     use crate::doctor::State;
-    use crate::doctor::machine::tests::{facts, says};
+    use crate::doctor::machine::{facts, says};
 
     fn two_files() -> Vec<SharedFile> {
         ["/dev/shm/sh_a_1", "/dev/shm/sh_a_2"]
