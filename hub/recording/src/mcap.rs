@@ -337,9 +337,6 @@ fn machine(sensor: &str) -> Option<&str> {
     sensor.split_once('.').map(|(machine, _)| machine)
 }
 
-/// Maximum number of runs of a hub that are remembered: one per minute for a month.
-const MAX_RUNS: usize = 50_000;
-
 /// Topic of a sensor that a channel has.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct ChannelTopic {
@@ -486,6 +483,8 @@ pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Optio
     is_same.then_some((header, payload))
 }
 
+/// Maximum number of runs of a hub that are remembered: one per minute for a month.
+const MAX_RUNS: usize = 50_000;
 /// Maximum number of sensors: those of sixteen hubs, each with as many as one can have.
 const MAX_SENSORS: usize = 4096;
 /// Maximum memory of channels and schemas. Files of many sensors have some hundred channels, and a megabyte of schemas.

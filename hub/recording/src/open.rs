@@ -407,20 +407,6 @@ fn refused(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
 }
 
-/// Maximum number of sensors that a failure names.
-const MAX_NAMES: usize = 32;
-const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
-/// First bytes of a gzip file.
-const GZIP: &[u8] = &[0x1F, 0x8B];
-/// First bytes of an MCAP file.
-const MCAP: &[u8] = b"\x89MCAP0\r\n";
-/// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
-const SEARCHED: usize = 256 * 1024;
-/// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
-const BUFFER: usize = 64 * 1024;
-/// Number of frames after which the packets of every model have shown it.
-const MODEL_FRAMES: usize = 500;
-
 /// Reader of a gzip file, with a limit. A kilobyte can unpack to a megabyte of the same byte, so a file that cannot be a recording
 /// is rejected early.
 struct GzipReader<R> {
@@ -475,6 +461,19 @@ impl<R: BufRead> BufRead for Counted<R> {
     }
 }
 
+/// Maximum number of sensors that a failure names.
+const MAX_NAMES: usize = 32;
+const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
+/// First bytes of a gzip file.
+const GZIP: &[u8] = &[0x1F, 0x8B];
+/// First bytes of an MCAP file.
+const MCAP: &[u8] = b"\x89MCAP0\r\n";
+/// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
+const SEARCHED: usize = 256 * 1024;
+/// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
+const BUFFER: usize = 64 * 1024;
+/// Number of frames after which the packets of every model have shown it.
+const MODEL_FRAMES: usize = 500;
 /// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has 100; the format allows 1,000.
 const MAX_RATIO: u64 = 400;
 /// Number of unpacked bytes up to which there is no limit.

@@ -161,24 +161,6 @@ fn gaussian(random: &mut fastrand::Rng) -> f64 {
     (0..12).map(|_| random.f64()).sum::<f64>() - 6.0
 }
 
-/// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which algorithms
-/// take for a change.
-pub const TAIL_MM: f64 = 60.0;
-
-/// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
-const MIN_SIGNAL: f64 = 0.0003;
-/// Share of the beams between two surfaces far apart whose signal is too weak.
-const WEAK_AT_EDGES: f64 = 0.15;
-
-// Codes are counted down from the greatest value (Telegram listing 10.8).
-pub(crate) const NO_RETURN: u16 = 0;
-pub(crate) const DAZZLE: u16 = 1;
-pub(crate) const TOO_WEAK: u16 = 4;
-const OVERFLOW: u16 = 2;
-/// Codes of beams that could have reported a range, with cumulative shares. They come from a recording of a real LMS 200, of
-/// beams that reported a range in at least 16 of 20 scans.
-const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
-
 /// Echo of a beam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Echo {
@@ -351,6 +333,21 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
     white * square / (range_mm / 1000.0).powi(2)
 }
 
+/// Standard deviation of the readings in the tail, in millimeters. Most of them differ by more than 30 mm, which algorithms
+/// take for a change.
+pub const TAIL_MM: f64 = 60.0;
+/// Minimum signal for a range, relative to a white surface at 1 m: 10 % of white at 18 m.
+const MIN_SIGNAL: f64 = 0.0003;
+/// Share of the beams between two surfaces far apart whose signal is too weak.
+const WEAK_AT_EDGES: f64 = 0.15;
+// Codes are counted down from the greatest value (Telegram listing 10.8).
+pub(crate) const NO_RETURN: u16 = 0;
+pub(crate) const DAZZLE: u16 = 1;
+pub(crate) const TOO_WEAK: u16 = 4;
+const OVERFLOW: u16 = 2;
+/// Codes of beams that could have reported a range, with cumulative shares. They come from a recording of a real LMS 200, of
+/// beams that reported a range in at least 16 of 20 scans.
+const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];
 /// Diameter of the spot at the window in millimeters, and its growth per millimeter of range.
 const SPOT_MM: f64 = 10.0;
 const SPOT_PER_MM: f64 = 0.0045;

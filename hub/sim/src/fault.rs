@@ -644,9 +644,6 @@ fn nanos(seconds: f64) -> Nanos {
     (seconds * 1e9) as Nanos
 }
 
-/// Time of a single fault without a configured time, in seconds. A session streams by then.
-const ONCE_S: f64 = 5.0;
-
 /// Delays of chunks: a line that is stuck for a while, and random delays. The order of the chunks never changes.
 #[derive(Clone, Debug)]
 pub(crate) struct Delay {
@@ -680,6 +677,9 @@ impl Delay {
         self.last_ns
     }
 }
+
+/// Time of a single fault without a configured time, in seconds. A session streams by then.
+const ONCE_S: f64 = 5.0;
 
 #[cfg(test)]
 mod tests {

@@ -230,17 +230,6 @@ impl MeasuredValues<'_> {
     }
 }
 
-fn beams(words: &[u16], first: u16, last: u16) -> Vec<u16> {
-    words[usize::from(first) - 1..usize::from(last)].to_vec()
-}
-
-fn append(writer: Writer, words: &[u16]) -> Writer {
-    words.iter().fold(writer, |writer, &word| writer.word(word))
-}
-
-/// Code of a value that could not be calculated, counted down from the maximum (Telegram listing 10.8).
-const OVERFLOW: u16 = 2;
-
 /// A source of measured-value telegrams.
 pub enum Source {
     /// A simulated room.
@@ -281,3 +270,14 @@ impl Source {
         matches!(self, Source::Room(_)) || *operating == Operating::All || !operating.streams()
     }
 }
+
+fn beams(words: &[u16], first: u16, last: u16) -> Vec<u16> {
+    words[usize::from(first) - 1..usize::from(last)].to_vec()
+}
+
+fn append(writer: Writer, words: &[u16]) -> Writer {
+    words.iter().fold(writer, |writer, &word| writer.word(word))
+}
+
+/// Code of a value that could not be calculated, counted down from the maximum (Telegram listing 10.8).
+const OVERFLOW: u16 = 2;

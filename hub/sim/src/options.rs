@@ -17,11 +17,6 @@ use crate::port;
 use crate::rplidar;
 use crate::world::World;
 
-/// Family of the scanners, unless an option names another one.
-pub const DEFAULT_FAMILY: &str = "lms";
-/// Type of the scanners of this family, unless an option names another one.
-pub const DEFAULT_TYPE: &str = "lms200";
-
 /// Options of the verb `simulate`.
 #[derive(Clone, Debug)]
 pub struct SimulateOptions {
@@ -375,6 +370,10 @@ fn one_of<T: Clone>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Fa
     })
 }
 
+/// Family of the scanners, unless an option names another one.
+pub const DEFAULT_FAMILY: &str = "lms";
+/// Type of the scanners of this family, unless an option names another one.
+pub const DEFAULT_TYPE: &str = "lms200";
 /// Measuring modes whose values contain a range (Telegram listing, 77h block D).
 const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F];
 

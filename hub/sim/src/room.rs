@@ -261,9 +261,6 @@ fn level(echo: &Echo, mode: Mode, rng: &BeamRng) -> u16 {
     (top * echo.bright + LEVEL_DEVIATION * rng.bright).round().clamp(0.0, max) as u16
 }
 
-/// Standard deviation of a reflector level; a recording of a standing sensor shows none at all.
-const LEVEL_DEVIATION: f64 = 0.1;
-
 /// A scan, and the true targets of its beams.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LabeledScan {
@@ -386,6 +383,8 @@ impl Changes {
     }
 }
 
+/// Standard deviation of a reflector level; a recording of a standing sensor shows none at all.
+const LEVEL_DEVIATION: f64 = 0.1;
 /// Time between the measured scans; it does not matter.
 const PERIOD: Nanos = 26_640_000;
 /// Start of the count of the first beam, in the unit of the range. With the count, it fits into 13 bits, below all codes.

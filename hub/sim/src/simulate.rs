@@ -494,17 +494,6 @@ fn same_rate(a: u32, b: u32) -> bool {
     u64::from(a.abs_diff(b)) * 100 <= 3 * u64::from(b)
 }
 
-/// Maximum lag of the scanner, in its own time: 5 kB at its highest rate, a quarter of the buffer of a pty.
-const MAX_LAG_NS: Nanos = 100 * MILLIS;
-/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel moves it.
-const PTY_DELAY_NS: Nanos = 2 * MILLIS;
-/// Interval at which a lossless line checks for room in the host's buffer.
-const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
-/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty of
-/// the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict scanner
-/// that a request was written without gaps.
-const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
-
 /// A telegram that a scanner sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
@@ -609,6 +598,17 @@ fn failure(path: &Path, error: &io::Error) -> Failure {
     let what = format!("cannot write the truth to {}: {error}", path.display());
     Failure::new(Kind::Failed, what, "the disk must have space, and the reader of stdout must stay")
 }
+
+/// Maximum lag of the scanner, in its own time: 5 kB at its highest rate, a quarter of the buffer of a pty.
+const MAX_LAG_NS: Nanos = 100 * MILLIS;
+/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel moves it.
+const PTY_DELAY_NS: Nanos = 2 * MILLIS;
+/// Interval at which a lossless line checks for room in the host's buffer.
+const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
+/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty of
+/// the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict scanner
+/// that a request was written without gaps.
+const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
 
 #[cfg(test)]
 mod tests {

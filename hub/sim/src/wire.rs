@@ -296,11 +296,6 @@ fn foreign(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     bytes
 }
 
-/// Lowest rate that RS-232 does not carry, in bits per second.
-const RS422_RATE: u32 = 500_000;
-/// Length of a stream's header in bytes: STX to count word.
-const HEADER: usize = 7;
-
 /// A receiver at the wrong rate.
 #[derive(Clone, Debug)]
 pub struct Receiver {
@@ -404,6 +399,10 @@ impl Receiver {
     }
 }
 
+/// Lowest rate that RS-232 does not carry, in bits per second.
+const RS422_RATE: u32 = 500_000;
+/// Length of a stream's header in bytes: STX to count word.
+const HEADER: usize = 7;
 /// Position in a bit at which the receiver samples. 0.40 to 0.48 agree with a recording of a real port at 19200 on a line
 /// at 38400; 0.5 and more do not (reference, section 2).
 const SAMPLE_POSITION: f64 = 0.45;

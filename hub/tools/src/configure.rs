@@ -375,9 +375,6 @@ fn lost_while_writing(port: &str, change: &Change, failure: &Failure) -> Failure
     Failure::new(failure.kind, what, format!("{kept}; {UNKNOWN_MODE}"))
 }
 
-/// Remedy for a scanner whose operating mode is unknown.
-const UNKNOWN_MODE: &str = "it may be in installation mode: scanhub run leaves it, or power it off and on";
-
 /// All settings that the command line requests.
 #[derive(Clone, Debug)]
 pub(crate) struct SettingsRequest(Vec<Setting>);
@@ -478,50 +475,6 @@ fn refused(key: &str, reason: &str) -> Failure {
 
 type Parse = fn(&str) -> Option<Setting>;
 
-/// The keys, their valid values as text, and their parsers.
-const KEYS: [(&str, &str, Parse); 7] = [
-    ("unit", "mm or cm", |value| match value {
-        "mm" => Some(Setting::Unit(Unit::Mm)),
-        "cm" => Some(Setting::Unit(Unit::Cm)),
-        _ => None,
-    }),
-    (
-        "mode",
-        "fields-abd (0x00), reflector3 (0x01), fields-abc (0x02), reflector2 (0x03), fields-ab (0x04), \
-         reflector1 (0x05), field-a (0x06), range (0x0F), energy (0x3F), or 0x0D and 0x0E",
-        |value| parse_mode(value).map(Mode).map(Setting::Mode),
-    ),
-    ("availability", "1, 2 or 3", |value| match value.parse() {
-        Ok(level @ 1..=3) => Some(Setting::Availability(level)),
-        _ => None,
-    }),
-    ("indices", "on or off", |value| match value {
-        "on" => Some(Setting::Indices(true)),
-        "off" => Some(Setting::Indices(false)),
-        _ => None,
-    }),
-    ("sensitivity", "standard, medium, low or high", |value| {
-        let at = SENSITIVITIES.iter().position(|name| *name == value)?;
-        Some(Setting::Sensitivity(at as u8))
-    }),
-    ("power_on_baud", "9600, or keep for the present rate", |value| match value {
-        "9600" => Some(Setting::PowerOn(PowerOn::Baud9600)),
-        "keep" => Some(Setting::PowerOn(PowerOn::KeepBaud)),
-        _ => None,
-    }),
-    ("configuration", "all 32 or 34 bytes in hex, as probe shows them", |value| {
-        let digits: Vec<u8> = value.chars().map(|c| Some(c.to_digit(16)? as u8)).collect::<Option<_>>()?;
-        let bytes: Vec<u8> =
-            digits.chunks(2).map(|pair| pair.iter().fold(0, |sum, d| sum << 4 | d)).collect();
-        digits
-            .len()
-            .is_multiple_of(2)
-            .then(|| OwnedConfiguration::new(&bytes))
-            .flatten()
-            .map(Setting::Configuration)
-    }),
-];
-
 /// Parses a measuring mode by name or number (Telegram listing, 77h block D).
 fn parse_mode(value: &str) -> Option<u8> {
     const NAMES: [(&str, u8); 9] = [
@@ -544,21 +497,6 @@ fn parse_mode(value: &str) -> Option<u8> {
     };
     (NAMES.iter().any(|(_, known)| *known == byte) || matches!(byte, 0x0D | 0x0E)).then_some(byte)
 }
-
-/// Sensitivities of the LMS 291 by their number: 30, 25, 20 and 42 m at 10 % (Telegram listing, 77h block C).
-const SENSITIVITIES: [&str; 4] = ["standard", "medium", "low", "high"];
-
-/// Index of the sensitivity in the configuration. All indices are from the Telegram listing, 77h blocks C to E.
-const SENSITIVITY: usize = 3;
-/// See [`SENSITIVITY`].
-const AVAILABILITY: usize = 4;
-/// See [`SENSITIVITY`].
-const MODE: usize = 5;
-/// See [`SENSITIVITY`].
-pub(crate) const UNIT: usize = 6;
-const LEVEL_3: u8 = 1;
-const INDICES: u8 = 2;
-const LEVEL_2: u8 = 4;
 
 /// Asks a person for consent to `plan`, whose differences were shown.
 ///
@@ -602,6 +540,64 @@ fn ask_person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
     Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "to write, answer: yes"))
 }
 
+/// Remedy for a scanner whose operating mode is unknown.
+const UNKNOWN_MODE: &str = "it may be in installation mode: scanhub run leaves it, or power it off and on";
+/// The keys, their valid values as text, and their parsers.
+const KEYS: [(&str, &str, Parse); 7] = [
+    ("unit", "mm or cm", |value| match value {
+        "mm" => Some(Setting::Unit(Unit::Mm)),
+        "cm" => Some(Setting::Unit(Unit::Cm)),
+        _ => None,
+    }),
+    (
+        "mode",
+        "fields-abd (0x00), reflector3 (0x01), fields-abc (0x02), reflector2 (0x03), fields-ab (0x04), \
+         reflector1 (0x05), field-a (0x06), range (0x0F), energy (0x3F), or 0x0D and 0x0E",
+        |value| parse_mode(value).map(Mode).map(Setting::Mode),
+    ),
+    ("availability", "1, 2 or 3", |value| match value.parse() {
+        Ok(level @ 1..=3) => Some(Setting::Availability(level)),
+        _ => None,
+    }),
+    ("indices", "on or off", |value| match value {
+        "on" => Some(Setting::Indices(true)),
+        "off" => Some(Setting::Indices(false)),
+        _ => None,
+    }),
+    ("sensitivity", "standard, medium, low or high", |value| {
+        let at = SENSITIVITIES.iter().position(|name| *name == value)?;
+        Some(Setting::Sensitivity(at as u8))
+    }),
+    ("power_on_baud", "9600, or keep for the present rate", |value| match value {
+        "9600" => Some(Setting::PowerOn(PowerOn::Baud9600)),
+        "keep" => Some(Setting::PowerOn(PowerOn::KeepBaud)),
+        _ => None,
+    }),
+    ("configuration", "all 32 or 34 bytes in hex, as probe shows them", |value| {
+        let digits: Vec<u8> = value.chars().map(|c| Some(c.to_digit(16)? as u8)).collect::<Option<_>>()?;
+        let bytes: Vec<u8> =
+            digits.chunks(2).map(|pair| pair.iter().fold(0, |sum, d| sum << 4 | d)).collect();
+        digits
+            .len()
+            .is_multiple_of(2)
+            .then(|| OwnedConfiguration::new(&bytes))
+            .flatten()
+            .map(Setting::Configuration)
+    }),
+];
+/// Sensitivities of the LMS 291 by their number: 30, 25, 20 and 42 m at 10 % (Telegram listing, 77h block C).
+const SENSITIVITIES: [&str; 4] = ["standard", "medium", "low", "high"];
+/// Index of the sensitivity in the configuration. All indices are from the Telegram listing, 77h blocks C to E.
+const SENSITIVITY: usize = 3;
+/// See [`SENSITIVITY`].
+const AVAILABILITY: usize = 4;
+/// See [`SENSITIVITY`].
+const MODE: usize = 5;
+/// See [`SENSITIVITY`].
+pub(crate) const UNIT: usize = 6;
+const LEVEL_3: u8 = 1;
+const INDICES: u8 = 2;
+const LEVEL_2: u8 = 4;
 /// Interval between checks for an interrupt.
 const STOP_CHECK_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
 

@@ -303,11 +303,6 @@ fn is_server(source: &Source) -> bool {
     matches!(source, Source::Tcp { .. })
 }
 
-/// Highest rate of an inquiry, in bits per second.
-pub(crate) const HIGHEST_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 1];
-/// Highest rate of an inquiry that every serial port supports, in bits per second.
-const RATE_OF_EVERY_PORT: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
-
 /// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes arrived.
 /// It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
 fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
@@ -422,6 +417,10 @@ fn toml_string(text: &str) -> String {
     string + "\""
 }
 
+/// Highest rate of an inquiry, in bits per second.
+pub(crate) const HIGHEST_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 1];
+/// Highest rate of an inquiry that every serial port supports, in bits per second.
+const RATE_OF_EVERY_PORT: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
 /// Name of the sensor; the user may choose another one.
 const NAME: &str = "front";
 

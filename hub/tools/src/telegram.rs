@@ -118,9 +118,6 @@ fn unreadable(name: &str, error: &io::Error) -> Failure {
     Failure::new(Kind::Input, format!("{name}: {error}"), hint)
 }
 
-/// Length of a piece that is read at once.
-const PIECE: usize = 16 * 1024;
-
 /// Reads bytes in pieces, and converts hexadecimal text.
 pub(crate) struct Input {
     reader: Box<dyn Read>,
@@ -555,14 +552,16 @@ fn rows(text: &mut String, bytes: &[u8], columns: &[&str], all: bool) -> std::fm
     Ok(())
 }
 
-/// Fields whose bytes or text people read, and not the number.
-const FRAME: [&str; 6] = ["STX", "address", "command", "error", "status", "checksum"];
-
 /// Returns at most `max` bytes in hexadecimal, with dots if there are more.
 fn hex(bytes: &[u8], max: usize) -> String {
     let shown: Vec<_> = bytes.iter().take(max).map(|byte| format!("{byte:02X}")).collect();
     shown.join(" ") + if bytes.len() > max { " .." } else { "" }
 }
+
+/// Length of a piece that is read at once.
+const PIECE: usize = 16 * 1024;
+/// Fields whose bytes or text people read, and not the number.
+const FRAME: [&str; 6] = ["STX", "address", "command", "error", "status", "checksum"];
 
 #[cfg(test)]
 mod tests {

@@ -300,11 +300,6 @@ fn line_ns(frame: &Frame) -> u64 {
     schema::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
-/// Maximum period, which fits into a header.
-const MAX_PERIOD_NS: u64 = 3_600_000_000_000;
-/// Monotonic clock at the first telegram, as on a machine that has just started.
-const UPTIME_NS: u64 = 10_000_000_000;
-
 /// Returns the missing responses, each with the number of the frame before which they belong.
 ///
 /// # Errors
@@ -406,6 +401,10 @@ impl Stream {
     }
 }
 
+/// Maximum period, which fits into a header.
+const MAX_PERIOD_NS: u64 = 3_600_000_000_000;
+/// Monotonic clock at the first telegram, as on a machine that has just started.
+const UPTIME_NS: u64 = 10_000_000_000;
 /// Kind of a telegram that is a response.
 const REPLY: &str = "reply";
 /// Time for which the packets of a stream are measured.

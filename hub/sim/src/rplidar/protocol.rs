@@ -338,11 +338,6 @@ impl Request {
     }
 }
 
-/// First byte of every request.
-const START: u8 = 0xA5;
-/// The bit of a command that has a payload.
-const PAYLOAD: u8 = 0x80;
-
 /// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the
 /// type.
 fn descriptor(len: usize, follows: bool, answer: u8) -> Vec<u8> {
@@ -420,11 +415,6 @@ pub(crate) fn boot_message(model: Model, id: u8) -> Vec<u8> {
     bytes.extend(b"\r\n");
     bytes
 }
-
-/// Duty cycle for the recommended speed, of 1,023. It is the vendor's default.
-pub(crate) const PWM: u16 = 660;
-/// Length of the boot message in bytes.
-const BOOT_MESSAGE_LEN: usize = 64;
 
 /// A point before it is encoded, with full resolution.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -573,6 +563,15 @@ fn twenty_bits(reading: &Reading) -> u32 {
         _ => 3 | ((mm - 24_565) / 5).min(0x1FFF) << 2 | (quality >> 3) << 15,
     }
 }
+
+/// First byte of every request.
+const START: u8 = 0xA5;
+/// The bit of a command that has a payload.
+const PAYLOAD: u8 = 0x80;
+/// Duty cycle for the recommended speed, of 1,023. It is the vendor's default.
+pub(crate) const PWM: u16 = 660;
+/// Length of the boot message in bytes.
+const BOOT_MESSAGE_LEN: usize = 64;
 
 #[cfg(test)]
 mod tests {

@@ -87,9 +87,6 @@ impl System {
     }
 }
 
-/// The version of this program.
-const VERSION: &str = env!("CARGO_PKG_VERSION");
-
 /// A program, compared with this one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum VersionMatch {
@@ -221,14 +218,6 @@ fn reported_version(program: &Path) -> Option<String> {
     None
 }
 
-/// Number of bytes that are compared at once.
-const PIECE: usize = 1 << 16;
-/// Maximum length of the output of `--version`, in bytes.
-const MAX_OUTPUT: u64 = 1 << 10;
-/// Number of polls: two seconds in total.
-const POLLS: u32 = 200;
-const POLL_INTERVAL: Duration = Duration::from_millis(10);
-
 /// Checks whether the service is installed, starts this version, and runs if it is enabled. `hub` is the process of the
 /// hub, if one runs.
 pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
@@ -348,28 +337,6 @@ fn is_running(system: &System) -> bool {
     groups.iter().any(|path| system.text(path).is_some_and(|pids| !pids.trim().is_empty()))
 }
 
-const UNIT: &str = "scanhub.service";
-const RULE: &str = "60-scanhub.rules";
-/// The rule of this version.
-const TEXT: &str = include_str!("../../../dist/60-scanhub.rules");
-/// Directories in which systemd searches for units, in its order.
-const UNITS: [&str; 5] = [
-    "etc/systemd/system",
-    "run/systemd/system",
-    "usr/local/lib/systemd/system",
-    "usr/lib/systemd/system",
-    "lib/systemd/system",
-];
-/// Directories in which udev searches for rules, in its order.
-const RULES: [&str; 5] = [
-    "etc/udev/rules.d",
-    "run/udev/rules.d",
-    "usr/local/lib/udev/rules.d",
-    "usr/lib/udev/rules.d",
-    "lib/udev/rules.d",
-];
-const INSTALL: &str = "sudo hub/dist/install.sh puts this version in place";
-
 /// Checks whether the shared memory of the hub of `user` remains when this user logs out. At the end of the last
 /// session of an ordinary user, logind removes their files in /dev/shm, even while a hub uses them (logind.conf(5),
 /// `RemoveIPC=`).
@@ -441,13 +408,43 @@ fn as_bool(value: &str) -> Option<bool> {
     }
 }
 
+#[cfg(test)]
+pub(crate) use tests::TempRoot;
+
+/// The version of this program.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// Number of bytes that are compared at once.
+const PIECE: usize = 1 << 16;
+/// Maximum length of the output of `--version`, in bytes.
+const MAX_OUTPUT: u64 = 1 << 10;
+/// Number of polls: two seconds in total.
+const POLLS: u32 = 200;
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
+const UNIT: &str = "scanhub.service";
+const RULE: &str = "60-scanhub.rules";
+/// The rule of this version.
+const TEXT: &str = include_str!("../../../dist/60-scanhub.rules");
+/// Directories in which systemd searches for units, in its order.
+const UNITS: [&str; 5] = [
+    "etc/systemd/system",
+    "run/systemd/system",
+    "usr/local/lib/systemd/system",
+    "usr/lib/systemd/system",
+    "lib/systemd/system",
+];
+/// Directories in which udev searches for rules, in its order.
+const RULES: [&str; 5] = [
+    "etc/udev/rules.d",
+    "run/udev/rules.d",
+    "usr/local/lib/udev/rules.d",
+    "usr/lib/udev/rules.d",
+    "lib/udev/rules.d",
+];
+const INSTALL: &str = "sudo hub/dist/install.sh puts this version in place";
 /// Directories in which systemd searches for its configuration, in its order.
 const CONFIGURATIONS: [&str; 4] = ["etc/systemd", "run/systemd", "usr/local/lib/systemd", "usr/lib/systemd"];
 /// Highest ID of a system user (systemd, SYSTEM_UID_MAX).
 const LAST_SYSTEM_USER: u32 = 999;
-
-#[cfg(test)]
-pub(crate) use tests::TempRoot;
 
 #[cfg(test)]
 mod tests {
