@@ -340,7 +340,7 @@ pub const TAIL_MM: f64 = 60.0;
 const MIN_SIGNAL: f64 = 0.0003;
 /// Share of the beams between two surfaces far apart whose signal is too weak.
 const WEAK_AT_EDGES: f64 = 0.15;
-// Codes are counted down from the greatest value (Telegram listing 10.8).
+// Codes are counted down from the maximum (Telegram listing 10.8).
 pub(crate) const NO_RETURN: u16 = 0;
 pub(crate) const DAZZLE: u16 = 1;
 pub(crate) const TOO_WEAK: u16 = 4;

@@ -119,7 +119,7 @@ faults! {
     loss, 0.0 to 0.5, 0.0, "share of the bytes from sensor to host that are lost";
     burst, 1.0 to 1000.0, 1.0, "mean number of bytes lost in a row, geometric";
     flip, 0.0 to 0.5, 0.0, "share of the bytes in which a run of flipped bits starts";
-    flip_bits, 1.0 to 64.0, 1.0, "mean number of neighbouring bits in a run, geometric";
+    flip_bits, 1.0 to 64.0, 1.0, "mean number of neighboring bits in a run, geometric";
     insert, 0.0 to 0.5, 0.0, "share of the bytes before which random ones are inserted";
     insert_burst, 1.0 to 1000.0, 1.0, "mean number of random bytes in a row, geometric";
     double, 0.0 to 0.5, 0.0, "share of the bytes that arrive twice";

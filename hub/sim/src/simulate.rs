@@ -509,7 +509,7 @@ pub struct Record {
     pub sha256: [u8; 32],
     /// CLOCK_MONOTONIC after its last byte was written, in nanoseconds.
     pub sent_ns: u64,
-    /// Fault because of which it did not arrive intact.
+    /// First fault that damaged it; `None` if it arrived intact.
     pub fault: Option<Fault>,
 }
 
