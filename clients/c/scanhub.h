@@ -61,7 +61,7 @@ enum scanhub_verdict {
     SCANHUB_CLEAR = 0, /* Nothing is inside any zone. */
     SCANHUB_SLOW = 1, /* Something is inside a zone, but not inside the smallest one. */
     SCANHUB_STOP = 2, /* Something is inside the smallest zone. */
-    SCANHUB_UNKNOWN = 3 /* Unknown: too many beams have no reading, or there are no scans. Treat it as stop. */
+    SCANHUB_UNKNOWN = 3 /* Too many beams have no reading, or there are no scans. Treat it as stop. */
 };
 
 /* Method by which a step was found. */
@@ -614,7 +614,7 @@ static inline enum scanhub_result scanhub_read_background(const struct scanhub_d
     return SCANHUB_OK;
 }
 
-/* The payload of topic `status`, 592 bytes: published each second and on every change. */
+/* The payload of topic `status`, 592 bytes: published every second and on every change. */
 struct scanhub_status {
     /* State of the link: 0 absent, 1 probing, 2 switching, 3 starting, 4 streaming, 5 silent, 6 paused. */
     uint8_t state;
@@ -902,7 +902,7 @@ struct scanhub_track_sensor {
     float x_m; /* Position along x, in meters on the map. */
     float y_m; /* Position along y, in meters on the map. */
     float yaw_rad; /* Direction ahead of the sensor, in radians counterclockwise from x. */
-    uint8_t upside_down; /* 1 if it is mounted upside down. */
+    uint8_t upside_down; /* 1 if the sensor is mounted upside down. */
     char name[57]; /* Name as clients use it. */
 };
 /* Returns element i of `sensors`, i below `sensor_count`. */

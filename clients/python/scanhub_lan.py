@@ -279,7 +279,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Status:
-    """The payload of topic `status`, 592 bytes: published each second and on every change."""
+    """The payload of topic `status`, 592 bytes: published every second and on every change."""
 
     state: Optional[str]
     """State of the link: one of STATES. None if this version does not have the value."""
@@ -466,7 +466,7 @@ class Site:
     yaw_rad: float
     """Direction ahead of the sensor, in radians counterclockwise from x."""
     upside_down: bool
-    """True if it is mounted upside down."""
+    """True if the sensor is mounted upside down."""
 
 
 @dataclass(frozen=True)

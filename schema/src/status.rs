@@ -13,7 +13,7 @@ use crate::{Family, Pose, text};
 /// Room for counters in a [`Status`]; new ones append.
 pub const COUNTERS: usize = 28;
 
-/// The payload of topic `status`, 592 bytes: published each second and on every change.
+/// The payload of topic `status`, 592 bytes: published every second and on every change.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Status.v2"))]
 #[repr(C)]
@@ -330,9 +330,9 @@ counters! {
     Suspect "suspect" "Telegrams of quality suspect.",
     Aborted "aborted" "Scans that the sensor broke off to answer a request.",
     Resyncs "resyncs" "Restarts of the session: no data for a second, power came on, or a request.",
-    Reconnects "reconnects" "How often the port went away.",
+    Reconnects "reconnects" "Number of times that the port became unavailable.",
     LostInRestart "lost_in_restart" "1 if the first telegram after the start followed a part of one.",
-    Wakeups "wakeups" "How often the link's thread woke up.",
+    Wakeups "wakeups" "Number of times that the link's thread woke up.",
     LoanFailed "loan_failed" "Samples not published because no chunk was free.",
     RejectedAddress "rejected_address" "Candidates rejected: the address does not belong to a sensor.",
     RejectedLength "rejected_length" "Candidates rejected: the length is impossible.",

@@ -71,7 +71,7 @@ pub struct TrackSensor {
     pub y_m: f32,
     /// Direction ahead of the sensor, in radians counterclockwise from x.
     pub yaw_rad: f32,
-    /// 1 if it is mounted upside down.
+    /// 1 if the sensor is mounted upside down.
     pub upside_down: u8,
     /// 0.
     pub reserved: [u8; 3],

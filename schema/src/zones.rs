@@ -105,7 +105,7 @@ pub enum Verdict {
     Slow = 1,
     /// Something is inside the smallest zone.
     Stop = 2,
-    /// Unknown: too many beams have no reading, or there are no scans. Treat it as stop.
+    /// Too many beams have no reading, or there are no scans. Treat it as stop.
     Unknown = 3,
 }
 

@@ -7,7 +7,7 @@ use schema::datagram::Announce;
 
 use super::c::{above, commented, number_name};
 use super::description::{Description, Field, Kind, Layout, snake};
-use super::readers::{self, Check, Finite, How, Shown};
+use super::readers::{self, Check, How, Run, Shown};
 use super::rules;
 
 /// Enums whose values have names in this header, with their names.
@@ -70,7 +70,7 @@ pub(crate) fn payloads(description: &Description) -> String {
         text += "};\n";
         for array in &arrays {
             if let Some(element) = array.element {
-                text += &accessor(description, topic, layout, array, element);
+                text += &accessor(description, topic, array, element);
             }
         }
         text += &reader(description, topic, layout, &arrays);
@@ -278,13 +278,7 @@ fn has_loop(description: &Description, layout: &Layout) -> bool {
 }
 
 /// Returns the struct of an array's elements, and the function that reads one.
-fn accessor(
-    description: &Description,
-    topic: Topic,
-    layout: &Layout,
-    array: &Array,
-    element: &Layout,
-) -> String {
+fn accessor(description: &Description, topic: Topic, array: &Array, element: &Layout) -> String {
     let (name, payload) = (element_name(element), topic.name());
     let mut text = format!("{}struct scanhub_{name} {{\n", above("", &element.doc));
     text += &members(description, element);
@@ -304,33 +298,18 @@ fn accessor(
     if element.name == "Segment" {
         text += "    out.support = (uint8_t)(foreground->supported >> i & 1);\n";
     }
-    let _ = layout;
     text + "    return out;\n}\n"
 }
 
 /// Returns conditions that are true if a number is not finite. Neighboring numbers are checked together.
 fn not_finite(layout: &Layout, base: &str, fields: usize) -> Vec<String> {
-    let mut conditions = Vec::new();
-    let mut runs: Vec<(usize, usize, usize)> = Vec::new();
-    for field in &layout.fields[..fields] {
-        let len = field.len.unwrap_or(1);
-        match (readers::finite(layout, field), runs.last_mut()) {
-            (Finite::Must, Some((at, size, count)))
-                if *size == field.element && *at + *size * *count == field.at =>
-            {
-                *count += len;
-            }
-            (Finite::Must, _) => runs.push((field.at, field.element, len)),
-            (Finite::MayBeNan, _) => conditions.push(format!("isinf({})", number_of(field, base))),
-            (Finite::NotChecked, _) => {}
-        }
-    }
-    let run = |(at, size, count)| match at {
+    let infinite =
+        readers::may_be_nan(layout, fields).map(|field| format!("isinf({})", number_of(field, base)));
+    let runs = readers::finite_runs(layout, fields).into_iter().map(|Run { at, size, count, .. }| match at {
         0 => format!("!scanhub_are_finite({base}, {size}, {count})"),
         at => format!("!scanhub_are_finite({base} + {at}, {size}, {count})"),
-    };
-    conditions.extend(runs.into_iter().map(run));
-    conditions
+    });
+    infinite.chain(runs).collect()
 }
 
 fn number_of(field: &Field, base: &str) -> String {

@@ -5,27 +5,19 @@ use std::fmt::Write as _;
 use schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, snake, upper_first};
-use super::readers::{self, Check, Finite, How, Shown};
+use super::readers::{self, Check, Finite, HEADS, How, Shown, names_of};
 use super::{rules, wrap};
 
 const WIDTH: usize = 120;
-
-/// Payloads whose arrays are read by hand, because they depend on each other. Only their heads are generated.
-const HEADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Returns the names of topics and of values.
 pub(crate) fn values(description: &Description) -> String {
     let topics = ["announce"].into_iter().chain(Topic::ALL.map(Topic::name));
     let mut text = table("TOPICS", "[0] = ", topics.map(str::to_owned));
-    let mut written = Vec::new();
-    for field in description.layouts.iter().flat_map(|layout| &layout.fields) {
-        let Some(set) = field.set.as_ref().filter(|set| is_enum(field, set)) else { continue };
-        if !written.contains(&set) {
-            written.push(set);
-            let first = if set == "Counter" { "" } else { "[0] = " };
-            let names = description.sets[set].values.iter().map(|value| value.name.clone());
-            text += &table(&names_of(set), first, names);
-        }
+    for set in readers::enums(description) {
+        let first = if set == "Counter" { "" } else { "[0] = " };
+        let names = description.sets[set].values.iter().map(|value| value.name.clone());
+        text += &table(&names_of(set), first, names);
     }
     text
 }
@@ -38,22 +30,6 @@ fn table(name: &str, first: &str, values: impl Iterator<Item = String>) -> Strin
     }
     let values = format!("{first}{},", values.join(", "));
     format!("local {name} = {{\n{}}}\n", wrap("    ", "    ", &values, WIDTH))
-}
-
-/// Returns whether the field has one of the set's values instead of bits.
-fn is_enum(field: &Field, set: &str) -> bool {
-    !["flags", "reasons", "contents"].contains(&field.name.as_str()) && set != "Quality"
-}
-
-/// Returns the name of the table with the names of an enum's values.
-fn names_of(set: &str) -> String {
-    match set {
-        "MotionMethod" => "METHODS".to_owned(),
-        "EventKind" => "EVENTS".to_owned(),
-        "Family" => "FAMILIES".to_owned(),
-        "PointClass" => "POINT_CLASSES".to_owned(),
-        name => format!("{}S", snake(name).to_uppercase()),
-    }
 }
 
 /// Returns the declarations of the fields of all payloads.
@@ -152,8 +128,10 @@ fn declaration(topic: Topic, layout: &Layout, shown: &Shown) -> String {
         How::Computed(doc) => (first_sentence(doc), String::new()),
         How::Plain | How::Bool => {
             let more = match field.set.as_deref() {
-                Some(set) if is_enum(field, set) => format!(", base.DEC, {}", names_of(set)),
-                Some(_) => ", base.HEX".to_owned(),
+                Some(_) => match readers::enum_of(field) {
+                    Some(set) => format!(", base.DEC, {}", names_of(set)),
+                    None => ", base.HEX".to_owned(),
+                },
                 None if layout.name == "Status" && field.name == "mode" => ", base.HEX".to_owned(),
                 None => String::new(),
             };
@@ -433,11 +411,9 @@ fn function(description: &Description, topic: Topic, layout: &Layout) -> String 
 /// flags that are set.
 fn summary(description: &Description, layout: &Layout, arrays: &[(&str, &str)]) -> String {
     let mut parts = Vec::new();
-    let values = layout.fields[..rules::head(layout).fields].iter();
-    let main = values.clone().find(|field| {
-        field.set.as_ref().is_some_and(|set| is_enum(field, set) && set != "Counter" && set != "Family")
-    });
-    if let Some((field, set)) = main.and_then(|field| Some((field, field.set.as_ref()?))) {
+    let fields = layout.fields[..rules::head(layout).fields].iter();
+    let mut enums = fields.filter_map(|field| Some((field, readers::enum_of(field)?)));
+    if let Some((field, set)) = enums.find(|(_, set)| !["Counter", "Family"].contains(set)) {
         let other = readers::other_value(set).unwrap_or("unknown");
         parts.push(format!("({}[{}] or \"{other}\")", names_of(set), number(field, "")));
     } else if layout.name == "Tilt" {

@@ -5,14 +5,10 @@ use std::fmt::Write as _;
 use schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, upper_first};
-use super::readers::{self, Check, Finite, How, Shown};
+use super::readers::{self, Check, HEADS, How, Shown, layouts, names_of};
 use super::{rules, wrap};
 
 const WIDTH: usize = 120;
-
-/// Payloads whose readers are written by hand, because their arrays depend on each other. Only their heads are
-/// generated.
-const HEADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Order of fields in the dataclasses where it is not that of the memory. Other fields follow.
 const ORDER: [(&str, &[&str]); 6] = [
@@ -54,27 +50,12 @@ fn class(layout: &Layout) -> String {
     }
 }
 
-/// Returns the name of the tuple with the names of an enum's values.
-fn names_of(set: &str) -> String {
-    match set {
-        "MotionMethod" => "METHODS".to_owned(),
-        "EventKind" => "EVENTS".to_owned(),
-        "Family" => "FAMILIES".to_owned(),
-        "PointClass" => "POINT_CLASSES".to_owned(),
-        name => format!("{}S", super::description::snake(name).to_uppercase()),
-    }
-}
-
 /// Returns the name of an array's field in the dataclass: `lines` for `line_array`.
 fn array_name(field: &Field) -> String {
     match field.name.as_str() {
         "sensor_array" => "sites".to_owned(),
         name => name.replace("_array", "s"),
     }
-}
-
-fn layouts(description: &Description) -> impl Iterator<Item = &Layout> {
-    description.layouts.iter().filter(|layout| layout.rust != "Header")
 }
 
 /// Returns the names and groups of topics, and the names of values.
@@ -85,21 +66,11 @@ pub(crate) fn constants(description: &Description) -> String {
     let groups = [schema::datagram::Announce::GROUP].into_iter().chain(groups);
     text +=
         &format!("_GROUPS = ({})\n", groups.map(|group| group.to_string()).collect::<Vec<_>>().join(", "));
-    let mut written = Vec::new();
-    for field in layouts(description).flat_map(|layout| &layout.fields) {
-        let Some(set) = field.set.as_ref().filter(|set| is_enum(field, set)) else { continue };
-        if !written.contains(&set) {
-            written.push(set);
-            text +=
-                &tuple(&names_of(set), description.sets[set].values.iter().map(|value| value.name.clone()));
-        }
+    for set in readers::enums(description) {
+        let names = description.sets[set].values.iter().map(|value| value.name.clone());
+        text += &tuple(&names_of(set), names);
     }
     text
-}
-
-/// Returns whether the field has one of the set's values instead of bits.
-fn is_enum(field: &Field, set: &str) -> bool {
-    field.name != "flags" && set != "Contents"
 }
 
 fn tuple(name: &str, values: impl Iterator<Item = String>) -> String {
@@ -194,7 +165,7 @@ fn kind(layout: &Layout, shown: &Shown) -> String {
         (How::Element(_), _) => number.to_owned(),
         (_, Kind::Text) => "str".to_owned(),
         (_, Kind::Layout(rust)) => rust.clone(),
-        _ => match field.set.as_deref().filter(|set| is_enum(field, set)) {
+        _ => match readers::enum_of(field) {
             Some("Counter") => "\"dict[str, int]\"".to_owned(),
             Some("EventKind") => "str".to_owned(),
             Some(set) if readers::other_value(set).is_some() => "str".to_owned(),
@@ -213,7 +184,7 @@ fn comment(description: &Description, shown: &Shown) -> String {
         How::Element(doc) => format!("{}.", upper_first(doc)),
         How::Computed(doc) => (*doc).to_owned(),
         How::Bool => description.doc(field).replacen("1 if", "True if", 1),
-        How::Plain => match field.set.as_deref().filter(|set| is_enum(field, set)) {
+        How::Plain => match readers::enum_of(field) {
             Some("Counter") => "Counters by name: those of COUNTERS.".to_owned(),
             Some(set) => {
                 let none =
@@ -342,15 +313,17 @@ fn function(description: &Description, layout: &Layout) -> String {
     for (count, most) in &counts {
         limit(format!("{} <= {most}", values.of_field(count)));
     }
-    // Neighboring numbers are checked together.
+    let fields = rules::head(layout).fields;
+    for field in readers::may_be_nan(layout, fields) {
+        limit(format!("not math.isinf({})", values.of_field(&field.name)));
+    }
+    // Numbers of both sizes are checked together.
     let mut finite: Vec<(usize, usize)> = Vec::new();
-    for field in &layout.fields[..rules::head(layout).fields] {
-        let (_, at, count) = values.positions.iter().find(|(name, ..)| *name == field.name).expect("a field");
-        match (readers::finite(layout, field), finite.last_mut()) {
-            (Finite::Must, Some((_, end))) if end == at => *end += count,
-            (Finite::Must, _) => finite.push((*at, at + count)),
-            (Finite::MayBeNan, _) => limit(format!("not math.isinf({})", values.of_field(&field.name))),
-            (Finite::NotChecked, _) => {}
+    for run in readers::finite_runs(layout, fields) {
+        let (_, at, _) = values.positions[run.field];
+        match finite.last_mut().filter(|(_, end)| *end == at) {
+            Some((_, end)) => *end += run.count,
+            None => finite.push((at, at + run.count)),
         }
     }
     for (at, end) in finite {
@@ -461,7 +434,7 @@ fn value(description: &Description, layout: &Layout, values: &Values, shown: &Sh
         (_, Kind::Layout(rust)) => {
             format!("{}(payload, {})", function_name(description.layout(rust)), field.at)
         }
-        _ => match field.set.as_deref().filter(|set| is_enum(field, set)) {
+        _ => match readers::enum_of(field) {
             Some("Counter") => format!("dict(zip(COUNTERS, {}))", raw()),
             Some(set) => {
                 let other =

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::description::{Field, Kind, Layout, Set};
+use super::description::{Description, Field, Kind, Layout, Set, snake};
 use super::rules::head;
 
 /// A field as the readers of datagrams show it.
@@ -134,6 +134,78 @@ pub(crate) fn finite(layout: &Layout, field: &Field) -> Finite {
         _ => Finite::NotChecked,
     }
 }
+
+/// Neighboring numbers of one size that must be finite.
+pub(crate) struct Run {
+    /// Index of the first field.
+    pub(crate) field: usize,
+    /// Offset in bytes.
+    pub(crate) at: usize,
+    /// Size of a number in bytes.
+    pub(crate) size: usize,
+    /// Number of numbers.
+    pub(crate) count: usize,
+}
+
+/// Returns the numbers that must be finite among the first `fields` fields.
+pub(crate) fn finite_runs(layout: &Layout, fields: usize) -> Vec<Run> {
+    let mut runs: Vec<Run> = Vec::new();
+    for (index, field) in layout.fields[..fields].iter().enumerate() {
+        if finite(layout, field) != Finite::Must {
+            continue;
+        }
+        let count = field.len.unwrap_or(1);
+        match runs
+            .last_mut()
+            .filter(|run| run.size == field.element && run.at + run.size * run.count == field.at)
+        {
+            Some(run) => run.count += count,
+            None => runs.push(Run { field: index, at: field.at, size: field.element, count }),
+        }
+    }
+    runs
+}
+
+/// Returns the fields among the first `fields` fields that may be NaN, but not infinite.
+pub(crate) fn may_be_nan(layout: &Layout, fields: usize) -> impl Iterator<Item = &Field> {
+    layout.fields[..fields].iter().filter(|field| finite(layout, field) == Finite::MayBeNan)
+}
+
+/// Returns the enum whose values a field has; `None` if it has bits, or any number.
+pub(crate) fn enum_of(field: &Field) -> Option<&str> {
+    let set = field.set.as_deref();
+    set.filter(|_| !["flags", "reasons", "contents"].contains(&field.name.as_str()))
+}
+
+/// Returns all layouts of payloads.
+pub(crate) fn layouts(description: &Description) -> impl Iterator<Item = &Layout> {
+    description.layouts.iter().filter(|layout| layout.rust != "Header")
+}
+
+/// Returns the enums of all fields, in the order of the fields.
+pub(crate) fn enums(description: &Description) -> Vec<&str> {
+    let mut enums = Vec::new();
+    for set in layouts(description).flat_map(|layout| &layout.fields).filter_map(enum_of) {
+        if !enums.contains(&set) {
+            enums.push(set);
+        }
+    }
+    enums
+}
+
+/// Returns the name of the list with the names of an enum's values.
+pub(crate) fn names_of(set: &str) -> String {
+    match set {
+        "MotionMethod" => "METHODS".to_owned(),
+        "EventKind" => "EVENTS".to_owned(),
+        "Family" => "FAMILIES".to_owned(),
+        "PointClass" => "POINT_CLASSES".to_owned(),
+        name => format!("{}S", snake(name).to_uppercase()),
+    }
+}
+
+/// Payloads whose arrays depend on each other, so that Python and Lua read them by hand. Only their heads are generated.
+pub(crate) const HEADS: [&str; 2] = ["Scan", "Foreground"];
 
 /// Returns the field and the value of it with which a field is unknown.
 pub(crate) fn unknown_if(layout: &Layout, field: &Field) -> Option<(&'static str, u64)> {

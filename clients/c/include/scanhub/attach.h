@@ -192,8 +192,7 @@ struct scanhub_zone_v2 {
 #define SCANHUB_VERDICT_CLEAR   0 /* Nothing is inside any zone. */
 #define SCANHUB_VERDICT_SLOW    1 /* Something is inside a zone, but not inside the smallest one. */
 #define SCANHUB_VERDICT_STOP    2 /* Something is inside the smallest zone. */
-/* Unknown: too many beams have no reading, or there are no scans. Treat it as stop. */
-#define SCANHUB_VERDICT_UNKNOWN 3
+#define SCANHUB_VERDICT_UNKNOWN 3 /* Too many beams have no reading, or there are no scans. Treat it as stop. */
 
 /* Flags of struct scanhub_zones_v2. */
 /* There were fewer scans than a violation requires, so no zone can be violated yet. */
@@ -284,9 +283,9 @@ enum scanhub_counter {
     SCANHUB_COUNTER_SUSPECT, /* Telegrams of quality suspect. */
     SCANHUB_COUNTER_ABORTED, /* Scans that the sensor broke off to answer a request. */
     SCANHUB_COUNTER_RESYNCS, /* Restarts of the session: no data for a second, power came on, or a request. */
-    SCANHUB_COUNTER_RECONNECTS, /* How often the port went away. */
+    SCANHUB_COUNTER_RECONNECTS, /* Number of times that the port became unavailable. */
     SCANHUB_COUNTER_LOST_IN_RESTART, /* 1 if the first telegram after the start followed a part of one. */
-    SCANHUB_COUNTER_WAKEUPS, /* How often the link's thread woke up. */
+    SCANHUB_COUNTER_WAKEUPS, /* Number of times that the link's thread woke up. */
     SCANHUB_COUNTER_LOAN_FAILED, /* Samples not published because no chunk was free. */
     SCANHUB_COUNTER_REJECTED_ADDRESS, /* Candidates rejected: the address does not belong to a sensor. */
     SCANHUB_COUNTER_REJECTED_LENGTH, /* Candidates rejected: the length is impossible. */
@@ -306,7 +305,7 @@ enum scanhub_counter {
     SCANHUB_COUNTER_SCANNER_RESTARTS
 };
 
-/* The payload of topic `status`, 592 bytes: published each second and on every change. */
+/* The payload of topic `status`, 592 bytes: published every second and on every change. */
 struct scanhub_status_v2 {
     uint8_t state; /* State of the link: SCANHUB_STATE_... */
     uint8_t mode; /* Measuring mode of an LMS; 255 if unknown. */
@@ -448,7 +447,7 @@ struct scanhub_track_sensor_v2 {
     float x_m; /* Position along x, in meters on the map. */
     float y_m; /* Position along y, in meters on the map. */
     float yaw_rad; /* Direction ahead of the sensor, in radians counterclockwise from x. */
-    uint8_t upside_down; /* 1 if it is mounted upside down. */
+    uint8_t upside_down; /* 1 if the sensor is mounted upside down. */
     uint8_t reserved[3];
     char name_text[56]; /* Name as clients use it. UTF-8, padded with 0; a text that fills it has no 0. */
 };
