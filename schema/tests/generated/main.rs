@@ -26,6 +26,8 @@ use std::path::Path;
 use std::{env, fs};
 
 use description::Description;
+use schema::Topic;
+use schema::limits::TopicLimits;
 
 const COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
 
@@ -76,6 +78,21 @@ fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
     lines.join("\n") + "\n"
 }
 
+/// Offsets are sums of sizes, so a wrong one would also make a wrong size.
+#[test]
+fn sizes_are_those_of_the_structs() {
+    let description = Description::read();
+    assert_eq!(description.layout("Header").size, size_of::<schema::Header>());
+    let limits = TopicLimits { beams: 0, contents: 0, ..TopicLimits::default() };
+    for topic in Topic::ALL {
+        let Some(layout) = description.payload(topic) else { continue };
+        let fixed =
+            |tail: &rules::Tail| Some(tail.count.parse::<usize>().ok()? * description.layout(tail.kind).size);
+        let arrays: usize = rules::tail(&layout.name).iter().filter_map(fixed).sum();
+        assert_eq!(layout.size + arrays, topic.longest(&limits), "{}", topic.name());
+    }
+}
+
 #[test]
 fn layouts_are_up_to_date() {
     check("tests/vectors/v2/layouts.txt", &Description::read().text());
@@ -96,8 +113,7 @@ fn c_is_up_to_date() {
 fn pages_are_up_to_date() {
     let description = Description::read();
     let layouts = ["Header"].into_iter().map(|rust| description.layout(rust));
-    let layouts =
-        layouts.chain(schema::Topic::ALL.into_iter().filter_map(|topic| description.payload(topic)));
+    let layouts = layouts.chain(Topic::ALL.into_iter().filter_map(|topic| description.payload(topic)));
     let tables: Vec<_> =
         layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
     check_blocks("docs/topics.md", &tables);
