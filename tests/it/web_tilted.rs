@@ -201,7 +201,7 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.press("c");
     page.await_true("scanhub.view.turn === 0");
     // Held, it stands; then it goes on.
-    hold(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep !== null");
+    hold(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep != null");
     let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100");
