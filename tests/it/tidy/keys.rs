@@ -1,4 +1,5 @@
-//! How many files name a key of the configuration: one with its field, and those that use it.
+//! Number of files that name a key of the configuration: one with its field, and those that use it. Files that name a
+//! processor: those of `hub/preprocess`, and the pipeline.
 
 use super::holds;
 use super::tree::{Tree, code};
@@ -44,5 +45,35 @@ fn a_key_is_in_few_files() {
             tree.with(&path, text)
         });
         vec![planted]
+    });
+}
+
+/// Types of processors. `hub/preprocess` has a file for each, and rules of its own.
+const PROCESSORS: [&str; 4] = ["MarkDetector", "LineFinder", "MotionEstimator", "Segmenter"];
+
+/// The file that calls all processors.
+const PIPELINE: &str = "hub/daemon/src/pipeline.rs";
+
+/// Product files that name a processor and may not.
+fn only_the_pipeline_names_a_processor(tree: &Tree) -> Vec<String> {
+    let is_outside = |path: &str| {
+        path.starts_with("hub/")
+            && !path.starts_with("hub/preprocess/")
+            && !path.contains("tests")
+            && path != PIPELINE
+    };
+    let named = |processor: &'static str| {
+        let others = tree.files(".rs").filter(move |(path, text)| {
+            is_outside(path) && code(text).any(|(_, line)| line.contains(processor))
+        });
+        others.map(move |(path, _)| format!("{path} names {processor}: call it in {PIPELINE}"))
+    };
+    PROCESSORS.into_iter().flat_map(named).collect()
+}
+
+#[test]
+fn only_the_pipeline_calls_processors() {
+    holds(only_the_pipeline_names_a_processor, |tree| {
+        vec![tree.with("hub/daemon/src/link.rs", "//! A link.\nlet marks = MarkDetector::new(settings);\n")]
     });
 }
