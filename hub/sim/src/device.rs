@@ -1,8 +1,8 @@
 //! The scanner's end of a line: the trait of every simulated scanner, and its transmitter.
 //!
 //! To drive a scanner, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
-//! [`Device::poll_timeout`]. [`Transmission`] sends one telegram or single byte at the rate of the line, in the chunks
-//! that the receiver's hardware delivers, and [`TxQueue`] everything that a rotating scanner sends.
+//! [`Device::poll_timeout`]. `Transmission` sends one telegram or single byte at the rate of the line, in the chunks
+//! that the receiver's hardware delivers, and `TxQueue` everything that a rotating scanner sends.
 
 use std::collections::VecDeque;
 

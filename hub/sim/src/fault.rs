@@ -8,8 +8,8 @@
 //!   are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
 //! - Damage to telegrams. A telegram is truncated, broken off or sent twice, or has another length field. Its random
 //!   numbers are drawn at its start.
-//! - Faults at a time, in time of the scanner: [`Schedule`] has points in time, [`Window`] spans of time, [`Extra`]
-//!   garbage between or inside telegrams, and [`Delay`] the delays of chunks.
+//! - Faults at a time, in time of the scanner: `Schedule` has points in time, `Window` spans of time, `Extra`
+//!   garbage between or inside telegrams, and `Delay` the delays of chunks.
 
 use std::fmt;
 use std::str::FromStr;

@@ -1,6 +1,6 @@
 //! The verb `simulate`: simulates scanners on ptys or TCP servers until it is stopped.
 //!
-//! Each port has a thread, [`PortThread`], which paces scanner and line by their deadlines and adds what happens at the
+//! Each port has a thread, `PortThread`, which paces scanner and line by their deadlines and adds what happens at the
 //! host's port: another rate, no host, a host that does not read, an unplugged adapter. [`Truth`] is the log of the
 //! telegrams: one line per telegram, and one per port at the end, in a file or on stdout. The hub never reads it.
 

@@ -1,7 +1,7 @@
 //! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a
 //! person, writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
 //!
-//! [`ask_person`] is the only place that creates consent: nothing is written into a scanner unless a person has typed
+//! `ask_person` is the only place that creates consent: nothing is written into a scanner unless a person has typed
 //! `yes`.
 
 use std::fmt;

@@ -1,6 +1,6 @@
 //! `scanhub telegram`: explains the telegrams of an LMS in a recording, in a stream of bytes, or in hexadecimal text.
 //!
-//! [`Input`] provides the bytes, [`StreamParser`] splits them into items, and [`ItemPrinter`] writes the items as text or
+//! `Input` provides the bytes, `StreamParser` splits them into items, and `ItemPrinter` writes the items as text or
 //! as lines of JSON. Text in the input is detected by its first bytes, because raw bytes are hardly ever all printable.
 
 mod parser;
