@@ -1,7 +1,8 @@
-"""The directory of a domain, opened so that no other user can put another one in its place: step by step from the root of
-the file system, its files relative to it. The same rules as the hub's (schema/shm/src/directory.rs): base and domain
-belong to this user and nobody else can write there; links are followed only above them, where root or this user made
-them. Refuses to know what the files are for.
+"""The directory of a domain. It is opened step by step from the root of the file system, and its files relative to it.
+So another user cannot replace it.
+
+The rules are those of the hub (schema/shm/src/directory.rs). Base and domain belong to this user, and no other user can
+write there. Links are followed only above them, if root or this user made the links.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ pub(crate) struct LinkCore<'a, S: Platform> {
 
 impl<'a, S: Platform> LinkCore<'a, S> {
     /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies the run
-    /// of the hub. Publishes nothing yet.
+    /// of the hub. The first sample follows with [`begin`](Self::begin).
     ///
     /// # Errors
     ///
@@ -173,7 +173,8 @@ impl<'a, S: Platform> LinkCore<'a, S> {
         }
     }
 
-    /// Saves the background if it is worth it. At the end of the hub (`is_last`), one new scan is enough.
+    /// Saves the background if it is new or has learned enough. At the end of the hub (`is_last`), one new scan is
+    /// enough.
     fn save_background(&mut self, is_last: bool) {
         if let Some(saved_state) = self.platform.saved_state()
             && let Some((pose, model)) = self.output.take_background_to_save(is_last)

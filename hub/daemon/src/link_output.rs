@@ -1,9 +1,9 @@
 //! The path of a scan, from the session to the subscribers of a link.
 //!
 //! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
-//! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the same
-//! path, `LinkOutput::publish_scan`: decode, zones, send, ring, the other processors, send. The last ring follows when all
-//! samples of the telegram are sent. Nothing on this path allocates, locks or logs.
+//! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
+//! same path, `LinkOutput::publish_scan`: decode, zones, send, ring, the other processors, send. The last ring follows
+//! when all samples of the telegram are sent. Nothing on this path allocates, locks or logs.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
@@ -14,6 +14,7 @@ use schema::{
 use crate::early::{EarlyMessage, EarlyWarner};
 use crate::pipeline::{Pipeline, ResultBuffers};
 use crate::platform::Platform;
+use crate::publisher::Loan;
 use crate::topics::Topics;
 
 /// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
@@ -49,7 +50,8 @@ pub(crate) struct Published {
     pub(crate) verdict_lifetime: Option<Nanos>,
 }
 
-/// Output of one link: its topics, the processors that compute the results in them, and the validity of the last verdict.
+/// Output of one link: its topics, the processors that compute the results in them, and the validity of the last
+/// verdict.
 pub(crate) struct LinkOutput<'a, S: Platform> {
     link: &'a Link,
     platform: &'a S,
@@ -65,7 +67,7 @@ pub(crate) struct LinkOutput<'a, S: Platform> {
 }
 
 impl<'a, S: Platform> LinkOutput<'a, S> {
-    /// Creates the output of `link`, and publishes nothing yet.
+    /// Creates the output of `link`. It publishes only on later calls.
     pub(crate) fn new(link: &'a Link, platform: &'a S, topics: Topics<'a, S>) -> Self {
         let beams = link.max_beams();
         LinkOutput {
@@ -140,8 +142,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
 
     /// Publishes a scan and the results that are computed from it. Subscribers to scan and zones are woken before the
     /// other results are computed; the caller wakes the rest. A result without a subscriber is computed only if the
-    /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is given.
-    /// Returns how long the verdict is valid.
+    /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is
+    /// given. Returns how long the verdict is valid.
     fn publish_scan(
         &mut self,
         raw: &RawScan<'_>,
@@ -175,12 +177,13 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         let mut marks = topics.publishers.marks.loan(0);
         let mut lines = topics.publishers.lines.loan(0);
         let mut motion = topics.publishers.motion.loan(0);
-        let mut foreground = topics.publishers.foreground.loan(Foreground::len(scan.beams()));
+        let len = Foreground::len(scan.beams());
+        let mut foreground = pipeline.has_background().then(|| topics.publishers.foreground.loan(len));
         let results = ResultBuffers {
             marks: marks.payload_mut(),
             lines: lines.payload_mut(),
             motion: motion.payload_mut(),
-            foreground: foreground.payload_mut(),
+            foreground: foreground.as_mut().and_then(Loan::payload_mut),
         };
         let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
         let reset = pipeline.process(scan, measured_ns, raw.period, results);
@@ -189,7 +192,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         topics.publishers.marks.send(marks, &header, &mut topics.due);
         topics.publishers.lines.send(lines, &header, &mut topics.due);
         topics.publishers.motion.send(motion, &header, &mut topics.due);
-        if pipeline.has_background() {
+        if let Some(foreground) = foreground {
             topics.publishers.foreground.send(foreground, &header, &mut topics.due);
         }
         if pipeline.publishes_every_scan() || pipeline.is_background_due() {
@@ -216,7 +219,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         lifetime
     }
 
-    /// Updates the processors from a scan that is not published. `measured_ns` is its stamp in the time of the recording.
+    /// Updates the processors from a scan that is not published. `measured_ns` is its stamp in the time of the
+    /// recording.
     pub(crate) fn learn(&mut self, raw: &RawScan<'_>, measured_ns: Nanos) {
         decode(raw, &mut self.scan);
         self.pipeline.check_zones(&self.scan, None);
@@ -348,8 +352,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.pipeline.handle(&self.link.name, verb, model)
     }
 
-    /// Returns the background for the next hub if it is worth saving. At the end of the hub (`is_last`), one new scan is
-    /// enough.
+    /// Returns the background for the next hub if it is worth saving. At the end of the hub (`is_last`), one new scan
+    /// is enough.
     pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         self.pipeline.take_background_to_save(is_last)
     }

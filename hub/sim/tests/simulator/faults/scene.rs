@@ -51,7 +51,7 @@ impl Verdict {
 }
 
 impl Scene {
-    /// Bad quirks show while the sensor is asked: it is idle then.
+    /// Creates a scene. Protocol quirks affect replies to requests, so a scanner that has them is idle.
     pub(crate) fn new(faults: Faults, span_ms: u64) -> Scene {
         Scene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
     }
