@@ -14,8 +14,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use scanhub_client::{Early, Header, Zones};
-use schema::Scan;
-use shm::Payload;
+use scanhub_schema::Scan;
+use scanhub_shm::Payload;
 use support::figures::{self, Cell, Figure, Target};
 use support::stage::{Child, PATIENCE, PROGRAM, Stage};
 use support::usage::Work;

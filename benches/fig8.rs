@@ -10,11 +10,11 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use preprocess::background::{Method, Model, Settings};
-use preprocess::segments::Segmenter;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
-use schema::{Background, Foreground, Nanos, Pose, Scan};
-use sim::room::Room;
+use scanhub_preprocess::background::{Method, Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Background, Foreground, Nanos, Pose, Scan};
+use scanhub_sim::room::Room;
 
 /// Number of scans, as in the paper's figure.
 const SCANS: u64 = 2_000;

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
-use schema::{Counter, Status};
+use scanhub_schema::{Counter, Status};
 use support::figures::{self, Figure, Target};
 use support::stage::{Child, PATIENCE, SENSORS, Stage};
 use support::truth::Truth;

@@ -10,12 +10,12 @@ mod decoded_scan;
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use preprocess::background::{self, Method, Model};
-use preprocess::segments::Segmenter;
-use preprocess::{marks, zones};
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
-use schema::{Foreground, Marks, Pose, Scan, Zones};
-use sim::room::Room;
+use scanhub_preprocess::background::{self, Method, Model};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_preprocess::{marks, zones};
+use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
+use scanhub_sim::room::Room;
 
 const POSE: Pose = Pose { x_m: 0.3, y_m: -0.1, yaw_rad: 0.2, upside_down: 0, reserved: [0; 7] };
 /// Of each scan.

@@ -11,7 +11,7 @@ use scanhub_drivers::lms::header::Expect;
 use scanhub_drivers::lms::measured::{self, Measured};
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Contents, Scan};
+use scanhub_schema::{Contents, Scan};
 use std::hint::black_box;
 
 /// Lengths of the reads for one telegram: as the hub reads, late on purpose, and as a UART hands bytes over.

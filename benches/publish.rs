@@ -15,9 +15,9 @@ use std::time::{Duration, Instant};
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use rustix::time::{ClockId, clock_gettime};
-use schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
-use schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
-use shm::{Bell, Node, Payload};
+use scanhub_schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
+use scanhub_schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
+use scanhub_shm::{Bell, Node, Payload};
 use support::source::{self, SENSOR, Source};
 use support::stage::{PATIENCE, Stage};
 use support::{Outcome, clock};
@@ -40,7 +40,7 @@ fn publish(c: &mut Criterion) {
         for count in CONSUMERS.into_iter().filter(|count| *count > 0 || rest == Rest::Awake) {
             let stage = Stage::new().expect("a domain");
             let mut source = Source::open(&stage.domain).expect("a publisher");
-            let node = shm::client_node(&stage.domain).expect("a node");
+            let node = scanhub_shm::client_node(&stage.domain).expect("a node");
             let crowd = Crowd::default();
             thread::scope(|scope| {
                 let _end = End(&crowd);
@@ -103,28 +103,33 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
     let subscriber = subscriber(node)?;
     let bell = Bell::open(node, SENSOR)?.ok_or("no bell")?;
     let listener = match rest {
-        Rest::Event => Some(shm::listener(&shm::open_wake(node, SENSOR)?.ok_or("no event")?)?),
+        Rest::Event => {
+            Some(scanhub_shm::listener(&scanhub_shm::open_wake(node, SENSOR)?.ok_or("no event")?)?)
+        }
         Rest::Awake | Rest::Bell => None,
     };
     crowd.ready.fetch_add(1, Ordering::Release);
     while !crowd.is_over.load(Ordering::Acquire) {
         let rung = bell.rung(Ring::First);
         if let Some(listener) = &listener {
-            shm::take_wakeups(&[listener])?;
+            scanhub_shm::take_wakeups(&[listener])?;
         }
         while Scan::receive(&subscriber).map_err(|error| format!("{error:?}"))?.is_some() {
             crowd.received.fetch_add(1, Ordering::Release);
         }
         match &listener {
-            Some(listener) => shm::sleep(&[listener], LOOK)?,
-            None => shm::sleep_at_bells(&[(&bell, Ring::First, rung)], clock::now() + LOOK.as_nanos() as u64)
-                .map_err(|_| "no bells on this system")?,
+            Some(listener) => scanhub_shm::sleep(&[listener], LOOK)?,
+            None => scanhub_shm::sleep_at_bells(
+                &[(&bell, Ring::First, rung)],
+                clock::now() + LOOK.as_nanos() as u64,
+            )
+            .map_err(|_| "no bells on this system")?,
         }
     }
     Ok(())
 }
 
-fn subscriber(node: &Node) -> Outcome<shm::Subscriber<Scan>> {
+fn subscriber(node: &Node) -> Outcome<scanhub_shm::Subscriber<Scan>> {
     let service = Scan::open(node, SENSOR)?.ok_or("no topic")?;
     Ok(Scan::subscriber(&service)?)
 }

@@ -27,8 +27,8 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit};
-use sim::options::{Scanner, SimulateOptions};
-use sim::{Event, simulate_with};
+use scanhub_sim::options::{Scanner, SimulateOptions};
+use scanhub_sim::{Event, simulate_with};
 
 use support::figures::{self, Figure, Target};
 use support::stage::{Child, PATIENCE, PROGRAM, Stage};
@@ -181,13 +181,13 @@ struct RotatingScanner {
 const SCANNERS: [RotatingScanner; 2] = [
     RotatingScanner {
         family: "ld",
-        scanner: Scanner::Ld(sim::ld::Model::Ld19),
+        scanner: Scanner::Ld(scanhub_sim::ld::Model::Ld19),
         back: "LD19: plugged in until a scan, longest",
         powered: "LD19: powered on until a scan, without 0.5 s of booting, longest",
     },
     RotatingScanner {
         family: "rplidar",
-        scanner: Scanner::Rplidar { model: sim::rplidar::Model::A1, mode: 3 },
+        scanner: Scanner::Rplidar { model: scanhub_sim::rplidar::Model::A1, mode: 3 },
         back: "RPLIDAR A1: plugged in until a scan, longest",
         powered: "RPLIDAR A1: powered on until a scan, without 0.5 s of booting, longest",
     },

@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Counter, Scan, Status};
+use scanhub_schema::{Counter, Scan, Status};
 use support::baseline::{self, Line as PtyLine};
 use support::figures::{self, Figure, Target};
 use support::stage::{Child, Guard, Line, PATIENCE, PROGRAM, Stage};

@@ -23,7 +23,7 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use browser::{Browser, Look};
-use schema::Scan;
+use scanhub_schema::Scan;
 use serde_json::{Value, json};
 use support::figures::{self, Figure, Target, percentile};
 use support::stage::{Child, PATIENCE, PROGRAM, SENSORS, Stage};

@@ -30,12 +30,12 @@ mod zones;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ::config::Sources;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use schema::{Failure, Family};
-use shm::{DEFAULT_DOMAIN, Domain, Environment};
-use verbs::{Bounds, duration};
+use scanhub_config::Sources;
+use scanhub_schema::{Failure, Family};
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
+use scanhub_verbs::{Bounds, duration};
 
 use crate::demo::{Families, World};
 
@@ -108,7 +108,7 @@ impl Everywhere {
 
     /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
     pub(crate) fn publisher_domain(&self) -> Result<Domain, Failure> {
-        shm::publisher_domain(&self.domain, self.root.as_deref(), &Environment::of_process())
+        scanhub_shm::publisher_domain(&self.domain, self.root.as_deref(), &Environment::of_process())
     }
 
     /// The directories that may hold domains.

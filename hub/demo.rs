@@ -14,11 +14,11 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::Domain;
+use scanhub_verbs::{Bounds, WatchOptions};
 use serde::Serialize;
 use serde_json::Value;
-use shm::Domain;
-use verbs::{Bounds, WatchOptions};
 
 use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
@@ -109,7 +109,7 @@ fn play_with_picture(
             play(options, stage, &mut |_, _| {}, &is_asked)
         });
         let closing = Raise(&closed);
-        let shown = verbs::watch(&picture, out, &over);
+        let shown = scanhub_verbs::watch(&picture, out, &over);
         drop(closing);
         let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         shown.and(played)

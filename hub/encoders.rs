@@ -4,11 +4,11 @@ use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread::{self, JoinHandle};
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher, Wake};
-use schema::limits::TopicLimits;
-use schema::{Failure, Flags, Header, Kind, Maker, Tilt};
-use shm::Domain;
-use sim::mount::Report;
-use sim::options::SimulateOptions;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Flags, Header, Kind, Maker, Tilt};
+use scanhub_shm::Domain;
+use scanhub_sim::mount::Report;
+use scanhub_sim::options::SimulateOptions;
 
 /// Publishing end of all mounts. Dropping it removes the topics.
 pub(crate) struct Encoders {

@@ -18,15 +18,15 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::error::ErrorKind;
-use config::Config;
 use rustix::process::Signal;
-use schema::csv::ScanColumns;
-use schema::{Failure, Kind, Printable, json_line};
+use scanhub_config::Config;
+use scanhub_schema::csv::ScanColumns;
+use scanhub_schema::{Failure, Kind, Printable, json_line};
+use scanhub_shm::{Domain, RunningHub};
+use scanhub_verbs::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 use serde::Serialize;
-use shm::{Domain, RunningHub};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
-use verbs::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 
 use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
@@ -50,7 +50,7 @@ fn main() -> ExitCode {
         Verb::Record(record) => record.is_to_stdout(),
         _ => false,
     };
-    daemon::explain_bus_error(cli.everywhere.json, quiet);
+    scanhub_daemon::explain_bus_error(cli.everywhere.json, quiet);
     match dispatch(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
@@ -85,7 +85,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::Telegram(telegram) => match &telegram.way {
-            Way::Decode(decode) => tools::telegram::decode(&decode.options(everywhere.json), &mut out),
+            Way::Decode(decode) => {
+                scanhub_tools::telegram::decode(&decode.options(everywhere.json), &mut out)
+            }
         },
         Verb::Probe(probe) => probe.run(everywhere, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere, &*interrupt_by(&ENDS)?),
@@ -100,16 +102,16 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
         Verb::List { domains: true } => {
             let hubs = if everywhere.root.is_none() { RunningHub::all(Path::new("/")) } else { Vec::new() };
-            verbs::list_domains(&everywhere.bases(), &hubs, everywhere.json, &mut out)
+            scanhub_verbs::list_domains(&everywhere.bases(), &hubs, everywhere.json, &mut out)
         }
         Verb::List { domains: false } => {
             let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
-            verbs::list(&options, &mut out, &*interrupt()?)
+            scanhub_verbs::list(&options, &mut out, &*interrupt()?)
         }
         Verb::Info { sensor } => {
             let options =
                 InfoOptions { sensor: sensor.clone(), json: everywhere.json, places: everywhere.places()? };
-            verbs::info(&options, &mut out, &*interrupt()?)
+            scanhub_verbs::info(&options, &mut out, &*interrupt()?)
         }
         Verb::Echo(echo) => {
             let format = match (everywhere.json, echo.csv, echo.raw) {
@@ -126,7 +128,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 bounds: echo.limits.bounds(),
                 places: everywhere.places()?,
             };
-            verbs::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Hz(hz) => {
             let options = HzOptions {
@@ -136,19 +138,19 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 bounds: hz.limits.bounds(),
                 places: everywhere.places()?,
             };
-            verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Latency(latency) => {
-            verbs::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Watch(watch) => {
             // The terminal is given back, whoever ends it.
             let stop = interrupt_by(&ENDS)?;
-            verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
+            scanhub_verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
         Verb::Web(web) => match &web.replay {
             Some(file) => replay::page::show(web, file, everywhere, &mut out, &interrupt()?),
-            None => verbs::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
+            None => scanhub_verbs::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
         },
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
@@ -156,36 +158,38 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             let mut stderr = io::stderr();
             match record.is_to_stdout() {
-                true => verbs::record(&options, &mut io::stderr(), &mut stderr, &stop),
-                false => verbs::record(&options, &mut out, &mut stderr, &stop),
+                true => scanhub_verbs::record(&options, &mut io::stderr(), &mut stderr, &stop),
+                false => scanhub_verbs::record(&options, &mut out, &mut stderr, &stop),
             }
         }
-        Verb::Control(control) => verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Control(control) => {
+            scanhub_verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?)
+        }
         Verb::Bridge(bridge) => bridge.run(everywhere).map(|never| match never {}),
         Verb::Key(key) => key.run(everywhere.json, &mut out),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.
             let options = background.options(everywhere)?;
-            verbs::background(&options, &mut out, &*interrupt()?)
+            scanhub_verbs::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
         Verb::Track(track) => {
-            verbs::track(&track.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::track(&track.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Tilt(tilt) => {
-            verbs::tilt(&tilt.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::tilt(&tilt.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Site(site) => site.run(everywhere.json),
         Verb::Leds(leds) => {
-            verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            scanhub_verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Gateway(gateway) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            verbs::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            scanhub_verbs::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
         Verb::Listen(listen) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            verbs::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            scanhub_verbs::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
         }
     }
 }
@@ -193,11 +197,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
 fn run_hub(run: &cli::Run, everywhere: &Everywhere) -> Result<(), Failure> {
     let read = || Config::load(&run.sources());
     let domain = everywhere.hub_domain()?;
-    daemon::run(&read, &domain, |ready| say_ready(ready, &domain, everywhere.json))
+    scanhub_daemon::run(&read, &domain, |ready| say_ready(ready, &domain, everywhere.json))
 }
 
 /// Says that a hub is up.
-fn say_ready(ready: &daemon::Ready, domain: &Domain, json: bool) {
+fn say_ready(ready: &scanhub_daemon::Ready, domain: &Domain, json: bool) {
     say(&if json {
         line(&HubReady {
             class: "ready",
@@ -228,7 +232,7 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
         let write = write.try_clone().map_err(no_handler)?;
         signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
     }
-    let announce = |ready: &[sim::Ready]| {
+    let announce = |ready: &[scanhub_sim::Ready]| {
         if everywhere.json {
             let ports =
                 ready.iter().map(|one| ReadyPort { port: &one.port, pty: one.pty.as_deref() }).collect();
@@ -240,7 +244,7 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
     };
     let encoders = Encoders::start(&simulate.angles, &options, &everywhere.publisher_domain()?)?;
     let report = |number, report| encoders.report(number, report);
-    sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, report).map(drop)
+    scanhub_sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, report).map(drop)
 }
 
 /// The line that says that the hub is up; keys in the order of their contract.
@@ -321,8 +325,8 @@ fn say(line: &str) {
 
 fn report(failure: &Failure, json: bool, quiet: bool) {
     match (json, quiet) {
-        (true, false) => say(&verbs::error_line(failure)),
-        (true, true) => complain(&verbs::error_line(failure)),
+        (true, false) => say(&scanhub_verbs::error_line(failure)),
+        (true, true) => complain(&scanhub_verbs::error_line(failure)),
         (false, _) => complain(&format!("scanhub: {failure}")),
     }
 }

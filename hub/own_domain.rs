@@ -2,8 +2,8 @@
 
 use std::ops::Deref;
 
-use schema::{Failure, Kind};
-use shm::{Directory, Domain, Environment};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::{Directory, Domain, Environment};
 use tempfile::TempDir;
 
 /// The domain. Its directory and its shared memory are removed when this is dropped.

@@ -11,13 +11,13 @@ use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
-use daemon::{Player, Progress};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::getpgrp;
 use rustix::termios::{
     LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcgetpgrp, tcsetattr,
 };
-use schema::Failure;
+use scanhub_daemon::{Player, Progress};
+use scanhub_schema::Failure;
 use serde::Serialize;
 
 use crate::cli::{Everywhere, Replay};
@@ -27,7 +27,7 @@ use mounts::Mounts;
 /// Runs until the recording has been played or the user ends it. Then prints a summary.
 pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Failure> {
     let domain = everywhere.hub_domain()?;
-    let options = daemon::Replay {
+    let options = scanhub_daemon::Replay {
         file: &replay.file,
         sensor: replay.sensor.as_deref(),
         family: replay.family,
@@ -37,7 +37,7 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
     };
     let mut console = None;
     let mut mounts = None;
-    let played = daemon::replay(&options, &domain, |ready, player| {
+    let played = scanhub_daemon::replay(&options, &domain, |ready, player| {
         let started = mounts.insert(Mounts::start(player, &domain));
         if started.is_err() {
             return player.end();

@@ -12,9 +12,9 @@ use rustix::net::{
     RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage,
     SendFlags, recvmsg, sendmsg,
 };
-use schema::{Ring, Wake};
-use shm::{Bell, Node, Waker};
-use shm::{Domain, Environment, HubLock};
+use scanhub_schema::{Ring, Wake};
+use scanhub_shm::{Bell, Node, Waker};
+use scanhub_shm::{Domain, Environment, HubLock};
 
 use super::message::{Label, PHASES, Way};
 use super::process::{Inlet, Outlet, Task};
@@ -33,7 +33,7 @@ impl Word {
     pub(crate) fn new(task: &Task) -> Outcome<Word> {
         let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
         let lock = HubLock::acquire(domain.root())?;
-        let node = shm::hub_node(&domain)?;
+        let node = scanhub_shm::hub_node(&domain)?;
         Ok(Word { waker: Waker::new(&node, SENSOR)?, _node: node, _lock: lock })
     }
 }
@@ -64,7 +64,7 @@ pub(crate) struct WordInlet {
 
 impl WordInlet {
     pub(crate) fn new(task: &Task) -> Outcome<WordInlet> {
-        let node = shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
+        let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
         let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
         let rung = bell.rung(Ring::First);
         Ok(WordInlet {
@@ -88,7 +88,7 @@ impl Inlet for WordInlet {
                 std::hint::spin_loop();
             } else {
                 let until = clock::now() + LONG_NS;
-                shm::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
+                scanhub_shm::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
                     .map_err(|error| format!("{error:?}"))?;
             }
         }

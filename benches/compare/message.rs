@@ -3,7 +3,7 @@
 
 use std::hint::black_box;
 
-use schema::{Contents, Scan};
+use scanhub_schema::{Contents, Scan};
 
 use crate::support::Outcome;
 

@@ -4,10 +4,10 @@
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_client::Subscription;
-use schema::limits::TopicLimits;
-use schema::{Header, Ring, Scan, ScanHead, Topic, Wake, limits};
-use shm::{Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker};
-use shm::{Domain, Environment, HubLock};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Header, Ring, Scan, ScanHead, Topic, Wake, limits};
+use scanhub_shm::{Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker};
+use scanhub_shm::{Domain, Environment, HubLock};
 
 use super::message::{BEAMS, Label, SCAN, SHORT, Way, contents};
 use super::process::{Inlet, Outlet, Task};
@@ -24,7 +24,7 @@ impl Hub {
     fn new(task: &Task) -> Outcome<Hub> {
         let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
         let lock = HubLock::acquire(domain.root())?;
-        let node = shm::hub_node(&domain)?;
+        let node = scanhub_shm::hub_node(&domain)?;
         Ok(Hub { waker: Waker::new(&node, SENSOR)?, node, _lock: lock })
     }
 
@@ -116,10 +116,10 @@ enum Wait {
 
 impl BytesInlet {
     pub(crate) fn new(task: &Task) -> Outcome<BytesInlet> {
-        let node = shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
+        let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
         let wait = if task.way == Way::Event {
-            let event = shm::open_wake(&node, SENSOR)?.ok_or("no event")?;
-            Wait::Event(Box::new(shm::listener(&event)?), false)
+            let event = scanhub_shm::open_wake(&node, SENSOR)?.ok_or("no event")?;
+            Wait::Event(Box::new(scanhub_shm::listener(&event)?), false)
         } else {
             let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
             let rung = bell.rung(Ring::First);
@@ -153,7 +153,7 @@ impl Wait {
             Wait::Bell(bell, rung, sleeps) => {
                 if bell.rung(Ring::First) == *rung && *sleeps {
                     let until = clock::now() + LONG_NS;
-                    shm::sleep_at_bells(&[(bell, Ring::First, *rung)], until)
+                    scanhub_shm::sleep_at_bells(&[(bell, Ring::First, *rung)], until)
                         .map_err(|error| format!("{error:?}"))?;
                 }
                 while bell.rung(Ring::First) == *rung && !*sleeps {
@@ -163,9 +163,9 @@ impl Wait {
                 Ok(())
             }
             Wait::Event(listener, taken) => {
-                *taken = !*taken && shm::take_wakeups(&[listener])?;
+                *taken = !*taken && scanhub_shm::take_wakeups(&[listener])?;
                 if !*taken {
-                    shm::sleep(&[listener], LONG)?;
+                    scanhub_shm::sleep(&[listener], LONG)?;
                 }
                 Ok(())
             }

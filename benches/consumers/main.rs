@@ -23,7 +23,7 @@ use std::thread;
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Counter, Status};
+use scanhub_schema::{Counter, Status};
 use support::figures::{self, Figure, Target};
 use support::stage::{Child, Line, PATIENCE, Stage};
 use support::usage::{Resident, Work};

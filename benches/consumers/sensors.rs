@@ -5,14 +5,14 @@ use std::path::Path;
 use std::thread;
 use std::time::Duration;
 
-use config::{Config, Sources};
 use rustix::time::{ClockId, clock_gettime};
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::telegram::STX;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::{Background, Failure, Foreground, Kind, Marks, Nanos, Scan, Status, Zones};
-use shm::{Node, Payload, Subscriber};
-use sim::room::Room;
+use scanhub_schema::{Background, Failure, Foreground, Kind, Marks, Nanos, Scan, Status, Zones};
+use scanhub_shm::{Node, Payload, Subscriber};
+use scanhub_sim::room::Room;
 
 use crate::growth::{Quantity, Sweep};
 use crate::support::figures::{self, Figure, Target, percentile};
@@ -238,7 +238,7 @@ pub(crate) fn drive(
     let stage = Stage::new()?;
     let config = config(sensors, variant)?;
     virtual_hub(&config, &stage.domain, |links| {
-        let node = shm::client_node(&stage.domain)?;
+        let node = scanhub_shm::client_node(&stage.domain)?;
         let followed = config.links.iter().filter(|_| followed);
         let subscribers: Vec<Subscribers> =
             followed.map(|link| Subscribers::attach(&node, &link.name)).collect::<Result<_, _>>()?;

@@ -6,14 +6,14 @@ use std::hint::black_box;
 use std::path::Path;
 use std::thread;
 
-use preprocess::{background, marks, segments, zones};
 use rustix::fs::{OFlags, fcntl_setfl};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::limits::TopicLimits;
-use schema::{Foreground, Marks, Pose, Scan, Zones};
+use scanhub_preprocess::{background, marks, segments, zones};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 
 use crate::datagrams;
 use crate::line::account::Parser;

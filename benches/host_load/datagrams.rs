@@ -9,7 +9,7 @@ use rustix::net::sockopt::{
 use rustix::net::{AddressFamily, SocketAddrV4, SocketFlags, SocketType, bind, socket_with};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
-use sim::room::Room;
+use scanhub_sim::room::Room;
 
 use crate::consumer::MODE;
 use crate::support::{Outcome, clock};

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::process::{Signal, set_parent_process_death_signal};
-use schema::Topic;
-use schema::datagram::{Datagram, HEAD, Packed};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Datagram, HEAD, Packed};
 
 use crate::support::figures::{Figure, Target, percentile};
 use crate::support::source::{self, SENSOR, Source};

@@ -24,8 +24,8 @@ use std::thread;
 use std::time::Duration;
 
 use machine::Machine;
-use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, MTU_SAFE, PORT, Packed};
-use schema::{Contents, Scan, ScanHead, Topic, Verdict, Zones};
+use scanhub_schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, MTU_SAFE, PORT, Packed};
+use scanhub_schema::{Contents, Scan, ScanHead, Topic, Verdict, Zones};
 use support::figures::{self, Figure, Target};
 use support::source;
 use support::stage::{PATIENCE, SENSORS, Stage};

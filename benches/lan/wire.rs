@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use rustix::net::sockopt::{set_ip_multicast_if, set_socket_recv_buffer_size_force};
 use rustix::process::{Pid, Signal, kill_process};
-use schema::Topic;
-use schema::datagram::{GROUPS, PORT, group};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{GROUPS, PORT, group};
 use serde_json::Value;
 
 use crate::support::stage::{Guard, PATIENCE, Stage};

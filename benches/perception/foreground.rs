@@ -11,10 +11,10 @@
 
 use std::ops::Range;
 
-use preprocess::background::{Method as Kind, Model, Settings, Start};
-use preprocess::segments::Segmenter;
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use schema::{Foreground, Pose, Scan};
+use scanhub_preprocess::background::{Method as Kind, Model, Settings, Start};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::scenes::{Boxes, Detector, HubDetector, LabeledScan, Scene, Score, play};

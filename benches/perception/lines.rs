@@ -10,8 +10,8 @@ use std::ops::Range;
 use std::time::Instant;
 
 use fastrand::Rng;
-use preprocess::lines::{LineFinder, Settings, Stop};
-use schema::{Lines, Pose, Scan};
+use scanhub_preprocess::lines::{LineFinder, Settings, Stop};
+use scanhub_schema::{Lines, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, normal, scan};
@@ -209,7 +209,7 @@ struct Score {
 impl Found {
     /// Returns the lines that the hub found, for a sensor at the robot's center.
     fn of(lines: &Lines) -> Found {
-        let line = |line: &schema::Line| {
+        let line = |line: &scanhub_schema::Line| {
             (usize::from(line.first), usize::from(line.last), f64::from(line.r_m), f64::from(line.alpha_rad))
         };
         Found { lines: lines.lines().iter().map(line).collect() }

@@ -6,9 +6,9 @@ use std::f64::consts::{PI, TAU};
 use std::time::Instant;
 
 use fastrand::Rng;
-use preprocess::lines::{LineFinder, Settings as LineSettings};
-use preprocess::motion::{MotionEstimator, Rigid, Settings};
-use schema::{Lines, Motion, Pose, Scan};
+use scanhub_preprocess::lines::{LineFinder, Settings as LineSettings};
+use scanhub_preprocess::motion::{MotionEstimator, Rigid, Settings};
+use scanhub_schema::{Lines, Motion, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, Drive, normal, scan};

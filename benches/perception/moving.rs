@@ -8,9 +8,9 @@
 use std::ops::Range;
 use std::time::Instant;
 
-use preprocess::background::{Class, Method, Model, Settings};
-use preprocess::motion::{self, MotionEstimator};
-use schema::{Foreground, Motion, Pose, Scan};
+use scanhub_preprocess::background::{Class, Method, Model, Settings};
+use scanhub_preprocess::motion::{self, MotionEstimator};
+use scanhub_schema::{Foreground, Motion, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings;

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 
 use fastrand::Rng;
 use flate2::read::MultiGzDecoder;
-use preprocess::motion::{Rigid, Settings};
-use schema::{Code, Scan, ScanHead};
+use scanhub_preprocess::motion::{Rigid, Settings};
+use scanhub_schema::{Code, Scan, ScanHead};
 use serde_json::Value;
 
 /// Names of the drives of model cars.

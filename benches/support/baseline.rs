@@ -192,7 +192,7 @@ impl Host {
     /// Sends `request` until the scanner replies.
     fn request(&mut self, request: Request) -> Outcome<()> {
         for _ in 0..TRIES {
-            let byte_time = schema::line_time(1, self.rate) + GAP;
+            let byte_time = scanhub_schema::line_time(1, self.rate) + GAP;
             for &byte in request.encode(0).bytes() {
                 let next = clock::now() + byte_time;
                 self.line.write(byte)?;

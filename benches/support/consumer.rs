@@ -9,9 +9,9 @@ use std::thread;
 use std::time::Duration;
 
 use scanhub_client::Subscription;
-use schema::{Header, Scan, Status, limits};
-use shm::Payload;
-use shm::{Domain, Environment};
+use scanhub_schema::{Header, Scan, Status, limits};
+use scanhub_shm::Payload;
+use scanhub_shm::{Domain, Environment};
 
 use super::stage::PATIENCE;
 use super::{Outcome, clock, truth};
@@ -51,7 +51,7 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
     while count == 0 || kept.len() < count {
         let Some(telegram) = telegrams.next()? else { continue };
         let now = clock::now();
-        let of_lms = schema::Telegram::of(telegram.header().family, &telegram);
+        let of_lms = scanhub_schema::Telegram::of(telegram.header().family, &telegram);
         if of_lms.is_none_or(|telegram| telegram.command() != lms::measured::MEASURED) {
             continue;
         }
@@ -90,7 +90,7 @@ pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
     println!("attaching {sensor}");
     loop {
         let Some(status) = statuses.next()? else { continue };
-        let state = status.state().map_or("unknown", schema::State::name);
+        let state = status.state().map_or("unknown", scanhub_schema::State::name);
         println!("status {sensor} {state} {} {}", status.since_ns, status.header().boot);
     }
 }

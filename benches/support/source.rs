@@ -1,9 +1,9 @@
 //! A hub without sensors, which publishes the same scan on request.
 
-use schema::limits::TopicLimits;
-use schema::{Header, Ring, Scan, ScanHead, Status, Wake};
-use shm::{Domain, HubLock};
-use shm::{Node, Payload, Publisher, TopicService, Waker};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Header, Ring, Scan, ScanHead, Status, Wake};
+use scanhub_shm::{Domain, HubLock};
+use scanhub_shm::{Node, Payload, Publisher, TopicService, Waker};
 
 use super::Outcome;
 
@@ -25,7 +25,7 @@ pub(crate) struct Source {
 impl Source {
     pub(crate) fn open(domain: &Domain) -> Outcome<Source> {
         let lock = HubLock::acquire(domain.root())?;
-        let node = shm::hub_node(domain)?;
+        let node = scanhub_shm::hub_node(domain)?;
         // Maximum number of subscribers in any bench.
         let limits = TopicLimits { consumers: 200, ..TopicLimits::default() };
         let waker = Waker::new(&node, SENSOR)?;

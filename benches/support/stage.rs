@@ -9,7 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use shm::{Domain, Environment};
+use scanhub_shm::{Domain, Environment};
 
 use super::{Outcome, PART, clock};
 

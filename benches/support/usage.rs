@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::{read_dir, read_to_string};
 use std::os::unix::fs::MetadataExt;
 
-use shm::Domain;
+use scanhub_shm::Domain;
 
 use super::Outcome;
 

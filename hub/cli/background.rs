@@ -4,8 +4,8 @@ use std::io::stdin;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use schema::Failure;
-use verbs::{BackgroundOptions, ModelOrder, saved_model};
+use scanhub_schema::Failure;
+use scanhub_verbs::{BackgroundOptions, ModelOrder, saved_model};
 
 use super::Everywhere;
 

@@ -7,8 +7,8 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 
 use clap::Args;
-use schema::{Failure, Kind};
-use tools::bridge_program::{PROGRAM, find, places};
+use scanhub_schema::{Failure, Kind};
+use scanhub_tools::bridge_program::{PROGRAM, find, places};
 
 use super::Everywhere;
 

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use clap::{Arg, Args, Command, CommandFactory};
-use shm::{Domain, Environment};
+use scanhub_shm::{Domain, Environment};
 
 use super::{Cli, command};
 use crate::print_own;
@@ -23,7 +23,7 @@ impl Complete {
         let line = Line::read(&command(), &self.words);
         let Some(name) = line.wanted else { return };
         let domain = line.value_of("domain").or_else(|| std::env::var("SCANHUB_DOMAIN").ok());
-        let domain = domain.unwrap_or_else(|| shm::DEFAULT_DOMAIN.to_owned());
+        let domain = domain.unwrap_or_else(|| scanhub_shm::DEFAULT_DOMAIN.to_owned());
         let root = line.value_of("root");
         let root = root.as_deref().map(std::path::Path::new);
         let Ok(places) = Domain::candidates(&domain, root, &Environment::of_process()) else { return };

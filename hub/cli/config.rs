@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use config::{DEFAULT, Link, Value, values};
-use schema::Failure;
+use scanhub_config::{DEFAULT, Link, Value, values};
+use scanhub_schema::Failure;
 use serde::Serialize;
 
 use super::{Everywhere, Gateway, Run};
@@ -45,7 +45,7 @@ impl Config {
                 }
                 let sources = sources.read();
                 Gateway::check(&sources, everywhere)?;
-                let links = config::Config::of(&sources)?.links;
+                let links = scanhub_config::Config::of(&sources)?.links;
                 if everywhere.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {

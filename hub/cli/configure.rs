@@ -4,9 +4,9 @@ use std::io::{IsTerminal, stderr, stdout};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use schema::Failure;
-use tools::configure::{ConfigureEvent, ConfigureRequest, configure};
-use tools::probe::source;
+use scanhub_schema::Failure;
+use scanhub_tools::configure::{ConfigureEvent, ConfigureRequest, configure};
+use scanhub_tools::probe::source;
 
 use super::Everywhere;
 use super::probe::Progress;

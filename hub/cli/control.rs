@@ -2,8 +2,8 @@
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use schema::{Failure, Verb};
-use verbs::ControlOptions;
+use scanhub_schema::{Failure, Verb};
+use scanhub_verbs::ControlOptions;
 
 use super::Everywhere;
 

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use recording::convert::{self, ConvertOptions, Converted};
-use recording::{Damage, Form, Unread};
-use schema::file::Compression;
-use schema::{Failure, Family};
+use scanhub_recording::convert::{self, ConvertOptions, Converted};
+use scanhub_recording::{Damage, Form, Unread};
+use scanhub_schema::file::Compression;
+use scanhub_schema::{Failure, Family};
+use scanhub_sim::options;
 use serde::Serialize;
-use sim::options;
 
 use crate::{complain, line, print};
 

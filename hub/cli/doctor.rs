@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use config::{Config, Gateway};
-use schema::Failure;
-use tools::doctor::{Bridge, CheckTargets, System, run_checks};
-use tools::probe::source;
+use scanhub_config::{Config, Gateway};
+use scanhub_schema::Failure;
+use scanhub_tools::doctor::{Bridge, CheckTargets, System, run_checks};
+use scanhub_tools::probe::source;
 
 use super::{Everywhere, Run};
 

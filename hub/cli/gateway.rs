@@ -6,10 +6,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use config::SourceMap;
-use schema::datagram::{Announce, GROUPS, PORT, group};
-use schema::{Failure, Kind, Topic};
-use verbs::{GatewayLook, GatewayOptions, duration};
+use scanhub_config::SourceMap;
+use scanhub_schema::datagram::{Announce, GROUPS, PORT, group};
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_verbs::{GatewayLook, GatewayOptions, duration};
 
 use super::{Configured, Everywhere};
 
@@ -51,7 +51,7 @@ pub(crate) struct Gateway {
 
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
-        let options = self.over(config::Gateway::load(&self.configured.sources())?, everywhere)?;
+        let options = self.over(scanhub_config::Gateway::load(&self.configured.sources())?, everywhere)?;
         if self.topics.is_empty() {
             // They come from the configuration.
             options.check().map_err(of_section)?;
@@ -61,12 +61,16 @@ impl Gateway {
 
     /// Checks that a gateway accepts the section in `sources`.
     pub(super) fn check(sources: &SourceMap, everywhere: &Everywhere) -> Result<(), Failure> {
-        let checked = Gateway::default().over(config::Gateway::of(sources)?, everywhere)?.check();
+        let checked = Gateway::default().over(scanhub_config::Gateway::of(sources)?, everywhere)?.check();
         checked.map_err(of_section)
     }
 
     /// These flags, and the values `said` in the section where a flag is missing.
-    fn over(&self, said: config::Gateway, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
+    fn over(
+        &self,
+        said: scanhub_config::Gateway,
+        everywhere: &Everywhere,
+    ) -> Result<GatewayOptions, Failure> {
         let every = background_every(&said)?;
         let or = |flags: &[String], said: Option<Vec<String>>| match flags {
             [] => said.unwrap_or_default(),
@@ -78,9 +82,9 @@ impl Gateway {
             to: or(&self.to, said.to),
             bare: self.bare || said.bare.unwrap_or_default(),
             key_file: self.key_file.clone().or(said.key_file),
-            ttl: self.ttl.or(said.ttl).unwrap_or(config::Gateway::TTL),
+            ttl: self.ttl.or(said.ttl).unwrap_or(scanhub_config::Gateway::TTL),
             background_every: self.background_every.or(every),
-            longest: self.mtu.or(said.mtu).unwrap_or(config::Gateway::MTU),
+            longest: self.mtu.or(said.mtu).unwrap_or(scanhub_config::Gateway::MTU),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => GatewayLook::Json,
                 (false, true) => GatewayLook::Terminal,
@@ -96,7 +100,7 @@ fn of_section(failure: Failure) -> Failure {
 }
 
 /// How often the configuration has the background sent.
-fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure> {
+fn background_every(said: &scanhub_config::Gateway) -> Result<Option<Duration>, Failure> {
     let every = said.background_every.as_ref().map(|(text, place)| {
         let refuse =
             |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m");
@@ -128,7 +132,7 @@ fn groups_and_topics() -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use verbs::network::Selection;
+    use scanhub_verbs::network::Selection;
 
     /// Reads a file of this repository, without line breaks, backquotes and the marks of doc comments.
     fn words_of(path: &str) -> String {

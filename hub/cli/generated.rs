@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use clap_complete::shells;
 use scanhub_files::output;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use super::{command, complete};
 use crate::print_own;

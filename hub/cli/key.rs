@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use schema::Failure;
+use scanhub_schema::Failure;
 
 #[derive(Args, Debug)]
 pub(crate) struct Key {
@@ -24,6 +24,6 @@ enum Order {
 impl Key {
     pub(crate) fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
         let Order::New { file } = &self.order;
-        verbs::new_key(file, json, out)
+        scanhub_verbs::new_key(file, json, out)
     }
 }

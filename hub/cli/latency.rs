@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use scanhub_client::Wait;
-use schema::Failure;
-use verbs::{LatencyOptions, duration};
+use scanhub_schema::Failure;
+use scanhub_verbs::{LatencyOptions, duration};
 
 use super::{Everywhere, Limits};
 

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use schema::Failure;
-use verbs::{LedsLook, LedsOptions, duration};
+use scanhub_schema::Failure;
+use scanhub_verbs::{LedsLook, LedsOptions, duration};
 
 use super::watch::colours;
 use super::{Everywhere, Limits};

@@ -4,10 +4,10 @@ use std::io::{IsTerminal, stdout};
 use std::path::PathBuf;
 
 use clap::Args;
-use schema::Failure;
-use schema::limits::TopicLimits;
-use shm::StateDirectory;
-use verbs::ListenOptions;
+use scanhub_schema::Failure;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_shm::StateDirectory;
+use scanhub_verbs::ListenOptions;
 
 use super::{Everywhere, Limits};
 

@@ -4,10 +4,10 @@ use std::io::{IsTerminal, Write, stderr};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use port::{Candidate, PortlessAdapter};
-use schema::Failure;
+use scanhub_port::{Candidate, PortlessAdapter};
+use scanhub_schema::Failure;
+use scanhub_tools::probe::{Ports, probe, source};
 use serde::Serialize;
-use tools::probe::{Ports, probe, source};
 
 use super::Everywhere;
 

@@ -4,9 +4,9 @@ use std::io::{IsTerminal, stderr, stdout};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use schema::Failure;
-use schema::file::Compression;
-use verbs::{RecordLook, RecordOptions, Split};
+use scanhub_schema::Failure;
+use scanhub_schema::file::Compression;
+use scanhub_verbs::{RecordLook, RecordOptions, Split};
 
 use super::{Everywhere, Limits};
 

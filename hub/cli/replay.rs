@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use daemon::{PlaybackOptions, PlaybackRate};
-use schema::{Failure, Family, Kind};
-use verbs::duration;
+use scanhub_daemon::{PlaybackOptions, PlaybackRate};
+use scanhub_schema::{Failure, Family, Kind};
+use scanhub_verbs::duration;
 
 use super::Configured;
 

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use schema::Failure;
-use sim::fault::Faults;
-use sim::options::{self, SimulateOptions};
-use verbs::duration;
+use scanhub_schema::Failure;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::options::{self, SimulateOptions};
+use scanhub_verbs::duration;
 
 #[derive(Args, Debug)]
 #[command(group = clap::ArgGroup::new("place").args(["port", "tcp"]).required(true).multiple(true))]
@@ -164,7 +164,7 @@ mod tests {
         let world = command.get_arguments().find(|argument| argument.get_id() == "world").expect("an option");
         let help = world.get_help().expect("a help").to_string();
         let words: Vec<&str> = help.split([' ', ',', ';']).collect();
-        for name in sim::world::World::names() {
+        for name in scanhub_sim::world::World::names() {
             assert!(words.contains(&name), "{name} is not in: {help}");
         }
     }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use tools::telegram::DecodeOptions;
+use scanhub_tools::telegram::DecodeOptions;
 
 #[derive(Args, Debug)]
 pub(crate) struct Telegram {

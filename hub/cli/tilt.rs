@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use clap::Args;
-use schema::Failure;
-use tilt::{Mount, Settings};
-use verbs::{Bounds, TiltOptions, duration};
+use scanhub_schema::Failure;
+use scanhub_tilt::{Mount, Settings};
+use scanhub_verbs::{Bounds, TiltOptions, duration};
 
 use super::Everywhere;
 
@@ -57,7 +57,7 @@ pub(crate) struct Tilt {
 
 /// A name that something can have which is no sensor.
 fn own_name(name: &str) -> Result<String, String> {
-    schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
+    scanhub_schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
 }
 
 fn number(text: &str) -> Result<f64, String> {

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use schema::Failure;
-use verbs::{Bounds, TrackOptions, duration};
+use scanhub_schema::Failure;
+use scanhub_verbs::{Bounds, TrackOptions, duration};
 
 use super::Everywhere;
 
@@ -33,13 +33,13 @@ pub(crate) struct Track {
 
 /// A name that topics of a tracker can have.
 fn tracker(name: &str) -> Result<String, String> {
-    schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
+    scanhub_schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
 }
 
 impl Track {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<TrackOptions, Failure> {
         Ok(TrackOptions {
-            site: track::Site::read(&self.site)?,
+            site: scanhub_track::Site::read(&self.site)?,
             name: self.name.clone(),
             count: self.count.clone(),
             delay: self.delay,

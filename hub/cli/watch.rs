@@ -3,8 +3,8 @@
 use std::io::{IsTerminal, stdout};
 
 use clap::Args;
-use schema::{Failure, Kind};
-use verbs::WatchOptions;
+use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::WatchOptions;
 
 use super::{Everywhere, Limits};
 

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use scanhub_files::regular;
-use schema::{Failure, Kind};
-use verbs::WebOptions;
+use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::WebOptions;
 
 use super::{Everywhere, Limits};
 
@@ -45,7 +45,7 @@ pub(crate) struct Web {
 }
 
 /// Port that `web` listens on if `--listen` names only an address.
-const DEFAULT_PORT: u16 = verbs::WEB_PORT;
+const DEFAULT_PORT: u16 = scanhub_verbs::WEB_PORT;
 
 /// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as does
 /// `localhost`.

@@ -5,8 +5,8 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use schema::Failure;
-use verbs::{MaskOptions, duration};
+use scanhub_schema::Failure;
+use scanhub_verbs::{MaskOptions, duration};
 
 use super::Everywhere;
 use super::probe::Progress;
@@ -54,6 +54,6 @@ impl Zones {
             Some(what) => progress.show(what),
             None => progress.clear(),
         };
-        verbs::mask(&options, out, &mut stderr(), &mut tell, stop)
+        scanhub_verbs::mask(&options, out, &mut stderr(), &mut tell, stop)
     }
 }

@@ -323,10 +323,10 @@ impl Sensor {
     }
 
     /// Returns the telegrams per second from the first to the last, or revolutions of a rotating scanner. `None` while
-    /// they span less than [`schema::MIN_RATE_SPAN`].
+    /// they span less than [`scanhub_schema::MIN_RATE_SPAN`].
     pub(crate) fn hz(&self) -> Option<f64> {
         let span = Duration::from_nanos(self.last_ns.saturating_sub(self.first_ns));
-        schema::rate_hz(self.received_count.saturating_sub(1), span)
+        scanhub_schema::rate_hz(self.received_count.saturating_sub(1), span)
     }
 
     fn seconds(&self) -> f64 {

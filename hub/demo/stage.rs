@@ -11,9 +11,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Failure, Family, Kind};
+use scanhub_schema::{Failure, Family, Kind};
+use scanhub_shm::Domain;
 use serde_json::Value;
-use shm::Domain;
 use tempfile::TempDir;
 
 use super::cast::{Sensor, World};

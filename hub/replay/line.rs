@@ -3,8 +3,8 @@
 use std::io::{self, Write, stderr};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use daemon::{PlaybackRate, Progress};
 use rustix::termios::tcgetwinsize;
+use scanhub_daemon::{PlaybackRate, Progress};
 
 /// The line at the bottom of stderr, until it is dropped.
 #[derive(Default)]

@@ -6,11 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread::{self, JoinHandle};
 
-use daemon::{Player, RecordedAngle, RecordedMount};
 use scanhub_client::{PublishSession, Wake};
-use schema::limits::TopicLimits;
-use schema::{Failure, Flags, Header, Kind, Maker, Tilt};
-use shm::Domain;
+use scanhub_daemon::{Player, RecordedAngle, RecordedMount};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Flags, Header, Kind, Maker, Tilt};
+use scanhub_shm::Domain;
 
 /// A thread for each mount of a recording. Dropping it ends the threads, and removes the topics.
 pub(crate) struct Mounts {

@@ -7,11 +7,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, mpsc};
 use std::thread;
 
-use config::Sources;
-use daemon::{PlaybackOptions, PlaybackRate, Player};
-use schema::{Failure, Kind};
-use verbs::WebOptions;
-use web::{Order, Playback, Progress};
+use scanhub_config::Sources;
+use scanhub_daemon::{PlaybackOptions, PlaybackRate, Player};
+use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::WebOptions;
+use scanhub_web::{Order, Playback, Progress};
 
 use crate::cli::{Everywhere, Web};
 use crate::own_domain::OwnDomain;
@@ -27,7 +27,7 @@ pub(crate) fn show(
     let domain = OwnDomain::new("web")?;
     let options = WebOptions { places: vec![domain.clone()], ..web.options(everywhere)? };
     let sources = Sources { files: Sources::system(), ..Sources::default() };
-    let replay = daemon::Replay {
+    let replay = scanhub_daemon::Replay {
         file,
         sensor: None,
         family: None,
@@ -42,14 +42,14 @@ pub(crate) fn show(
         let hub = thread::Builder::new().name("hub".into()).spawn_scoped(scope, move || {
             // Whichever way it ends, the page ends, too.
             let _over = Over(stop);
-            daemon::replay(replay, domain, |_, player| {
+            scanhub_daemon::replay(replay, domain, |_, player| {
                 let _ = ready.send(Keys(player.clone()));
             })
         });
         let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let mut shown = Ok(());
         if let Ok(keys) = is_ready.recv() {
-            shown = verbs::web(&options, Some(&keys), out, stop);
+            shown = scanhub_verbs::web(&options, Some(&keys), out, stop);
             keys.0.end();
         }
         match hub.join() {

@@ -176,7 +176,7 @@ impl<'a> Datagram<'a> {
     /// # Examples
     ///
     /// ```
-    /// use schema::datagram::{Datagram, DatagramError};
+    /// use scanhub_schema::datagram::{Datagram, DatagramError};
     ///
     /// assert_eq!(Datagram::read(b"SHUB"), Err(DatagramError::Short));
     /// ```

@@ -72,7 +72,7 @@ impl Header {
     /// # Examples
     ///
     /// ```
-    /// use schema::{Header, Quality, Reasons};
+    /// use scanhub_schema::{Header, Quality, Reasons};
     ///
     /// let header = Header { quality: 1, reasons: Reasons::SLOW, ..Header::default() };
     /// assert_eq!(header.quality(), Quality::Suspect);

@@ -87,7 +87,7 @@ sliced! {
     /// # Examples
     ///
     /// ```
-    /// use schema::{Code, Scan, ScanHead};
+    /// use scanhub_schema::{Code, Scan, ScanHead};
     ///
     /// let head = ScanHead { unit_um: 10_000, valid_to: 8182, no_return: 8191, step: 0.5_f64.to_radians(), ..ScanHead::default() };
     /// let scan = Scan::of(head, &[123, 8191]);

@@ -179,7 +179,7 @@ impl fmt::Debug for Cloud {
 /// # Examples
 ///
 /// ```
-/// use schema::{Cloud, CloudHead, CloudPoint, Header, SweepPoints};
+/// use scanhub_schema::{Cloud, CloudHead, CloudPoint, Header, SweepPoints};
 ///
 /// let mut sweep = SweepPoints::default();
 /// for (topic_seq, flags) in [(7, Cloud::FIRST), (8, 0), (9, Cloud::LAST)] {

@@ -22,9 +22,9 @@ use crate::{Failure, Kind};
 ///         [$(stringify!($name)),*]
 ///     };
 /// }
-/// let names = schema::for_each_topic!(names);
+/// let names = scanhub_schema::for_each_topic!(names);
 /// assert_eq!((names[1], names[names.len() - 1]), ("scan", "obstacles"));
-/// let names = schema::for_each_topic!(links: names);
+/// let names = scanhub_schema::for_each_topic!(links: names);
 /// assert_eq!((names[1], names[names.len() - 1]), ("scan", "early"));
 /// ```
 #[macro_export]
@@ -96,8 +96,8 @@ macro_rules! for_each_topic {
 /// # Examples
 ///
 /// ```
-/// assert_eq!(size_of::<schema::payload_type!(Marks)>(), 1028);
-/// let telegram: &schema::payload_type!([u8]) = &[2, 0x80];
+/// assert_eq!(size_of::<scanhub_schema::payload_type!(Marks)>(), 1028);
+/// let telegram: &scanhub_schema::payload_type!([u8]) = &[2, 0x80];
 /// ```
 #[macro_export]
 macro_rules! payload_type {
@@ -234,7 +234,7 @@ impl Topic {
     /// # Examples
     ///
     /// ```
-    /// use schema::Topic;
+    /// use scanhub_schema::Topic;
     ///
     /// assert_eq!(Topic::parse("scan"), Some(Topic::Scan));
     /// assert_eq!(Topic::Scan.service("front"), "scanhub/v2/front/scan");

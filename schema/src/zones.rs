@@ -64,7 +64,7 @@ impl Zones {
     /// # Examples
     ///
     /// ```
-    /// use schema::{Verdict, Zones};
+    /// use scanhub_schema::{Verdict, Zones};
     ///
     /// assert_eq!(Zones::unknown().verdict(), Verdict::Unknown);
     /// // An object inside outweighs missing data.

@@ -8,10 +8,10 @@ mod values;
 #[path = "../../tests/it/lan/vectors.rs"]
 mod vectors;
 
-use schema::datagram::{
+use scanhub_schema::datagram::{
     Datagram, DatagramError, Fresh, HEAD, Head, LanFlags, MTU_LEAST, MTU_SAFE, StreamStats,
 };
-use schema::{Family, Topic};
+use scanhub_schema::{Family, Topic};
 use vectors::{Vector, bytes, vectors};
 
 fn vector(name: &str) -> Vec<u8> {

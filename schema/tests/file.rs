@@ -4,9 +4,9 @@
 
 use std::collections::BTreeMap;
 
-use schema::datagram::Packed;
-use schema::file::{Writer, parts};
-use schema::{Flags, Header, Topic, Zones};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{Writer, parts};
+use scanhub_schema::{Flags, Header, Topic, Zones};
 
 fn header(seq: u64, topic_seq: u64) -> Header {
     let at = 5_000_000_000 + seq * 26_666_667;

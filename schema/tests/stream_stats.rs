@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use fastrand::Rng;
-use schema::datagram::{
+use scanhub_schema::datagram::{
     Announce, Announced, DatagramError, Fresh, GivenUp, HEAD, Head, LIVES, Packed, ROWS, StreamStats, WINDOW,
 };
-use schema::{Background, Marks, Topic, Zones};
+use scanhub_schema::{Background, Marks, Topic, Zones};
 
 /// Hub, epoch, sensor, topic.
 type Key = (u64, u32, u8, u8);

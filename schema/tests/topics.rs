@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 /// Text of a file, by its path from the top of the repository.
 fn text(path: &str) -> String {

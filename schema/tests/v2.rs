@@ -16,7 +16,7 @@ mod tracks;
 
 use std::mem::{offset_of, size_of};
 
-use schema::{
+use scanhub_schema::{
     Background, BackgroundHead, BackgroundWord, COUNTERS, Counter, Counters, Failure, Foreground,
     ForegroundHead, ForegroundWord, Header, Kind, Mark, Marks, Pose, Request, Response, SEGMENTS, Segment,
     Shown, State, Status, Verb, Zone, Zones,

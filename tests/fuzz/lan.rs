@@ -1,7 +1,7 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
-use schema::Topic;
-use schema::datagram::{
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{
     Announce, Datagram, DatagramError, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, StreamStats,
 };
 
@@ -105,10 +105,10 @@ fn can_be_said_again(datagram: &Datagram<'_>) {
     };
     macro_rules! by_topic {
         ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-            match topic { $(Topic::$topic => again::<schema::payload_type!($payload)>(payload),)* }
+            match topic { $(Topic::$topic => again::<scanhub_schema::payload_type!($payload)>(payload),)* }
         };
     }
-    schema::for_each_topic!(by_topic);
+    scanhub_schema::for_each_topic!(by_topic);
 }
 
 /// The checksum sees one to three changed bits, wherever they are (its Hamming distance at these lengths is 4).

@@ -1,10 +1,10 @@
 //! Any scans and any settings, through all processors: whatever the bytes say, what comes out keeps to its own rules.
 
-use preprocess::background::{Candidate, Method, Model, Settings, Start};
-use preprocess::segments::Segmenter;
-use preprocess::{marks, zones};
-use schema::limits::TopicLimits;
-use schema::{BEAMS, Background, Contents, Foreground, Marks, Scan, Verdict, ZONES, Zones};
+use scanhub_preprocess::background::{Candidate, Method, Model, Settings, Start};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_preprocess::{marks, zones};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{BEAMS, Background, Contents, Foreground, Marks, Scan, Verdict, ZONES, Zones};
 
 use super::scans::{Bytes, fill, layout};
 

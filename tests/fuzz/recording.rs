@@ -3,10 +3,10 @@
 
 use std::fs;
 
-use recording::{Encoding, Form, Recording};
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::Family;
+use scanhub_recording::{Encoding, Form, Recording};
+use scanhub_schema::Family;
 use tempfile::NamedTempFile;
 
 /// Any bytes as a file.

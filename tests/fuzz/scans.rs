@@ -1,6 +1,6 @@
 //! Scans, and what they are read as, from the bytes of an input. Refuses to know who looks at them.
 
-use schema::{BEAMS, Contents, Family, Pose, Scan, ScanArrays, ScanHead};
+use scanhub_schema::{BEAMS, Contents, Family, Pose, Scan, ScanArrays, ScanHead};
 
 /// Another sensor, or the same one set otherwise; now and then one that there is.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {

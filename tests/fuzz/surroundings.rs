@@ -1,12 +1,12 @@
 //! Any scans through those processors that follow the robot: lines, motion, and the map around it. Whatever the bytes say,
 //! what comes out keeps to its own rules, and nothing is surer than the readings that say it.
 
-use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
-use preprocess::lines::{self, LineFinder, Stop};
-use preprocess::motion::{self, MotionEstimator};
-use schema::datagram::Packed;
-use schema::limits::TopicLimits;
-use schema::{BEAMS, Contents, Foreground, Lines, Motion, MotionMethod, Scan};
+use scanhub_preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
+use scanhub_preprocess::lines::{self, LineFinder, Stop};
+use scanhub_preprocess::motion::{self, MotionEstimator};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{BEAMS, Contents, Foreground, Lines, Motion, MotionMethod, Scan};
 
 use super::scans::{Bytes, fill, layout};
 

@@ -7,7 +7,6 @@ mod recording;
 mod scans;
 mod surroundings;
 
-use lms_configure::eeprom::Write;
 use scanhub_drivers::line::Control;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms;
@@ -21,7 +20,8 @@ use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MILLIS, Nanos};
+use scanhub_lms_configure::eeprom::Write;
+use scanhub_schema::{MILLIS, Nanos};
 
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));
@@ -220,7 +220,7 @@ fn assert_harmless(said: &[u8]) {
 ///
 /// The text is cut at zero bytes: the first piece is a file, the others are `--set` and `--link` in turn.
 pub fn configuration(data: &[u8]) {
-    use config::{Config, Sources};
+    use scanhub_config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
     let mut pieces = text.split('\0');
     let path = tempfile::NamedTempFile::new().expect("a temporary file").into_temp_path();

@@ -10,7 +10,7 @@ use std::process::{Command, Output};
 
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number, output};
 use installed::{Installed, header_directory, is_there, source};
-use schema::{Code, Contents, Header, Scan};
+use scanhub_schema::{Code, Contents, Header, Scan};
 use serde_json::Value;
 
 fn succeeded(output: &Output) -> String {

@@ -56,7 +56,7 @@ fn checks(outcome: Outcome, code: i32) -> (Vec<Value>, Outcome) {
 fn the_page_has_a_line_for_each_check() {
     let page = include_str!("../../docs/doctor.md");
     let lines = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
-    assert_eq!(lines.collect::<Vec<_>>(), tools::doctor::CHECKS);
+    assert_eq!(lines.collect::<Vec<_>>(), scanhub_tools::doctor::CHECKS);
 }
 
 #[test]

@@ -12,9 +12,9 @@ use crate::testkit::{
     Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip, succeeds,
     write_program,
 };
-use config::Gateway;
-use shm::Domain;
-use tools::doctor::{Bridge, CheckTargets, System, run_checks};
+use scanhub_config::Gateway;
+use scanhub_shm::Domain;
+use scanhub_tools::doctor::{Bridge, CheckTargets, System, run_checks};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
@@ -95,8 +95,9 @@ fn with_ports(env: &TestEnv) -> Findings {
         clean: false,
     };
     let mut lines = Vec::new();
-    let mut tell =
-        |finding: &tools::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
+    let mut tell = |finding: &scanhub_tools::doctor::Finding| {
+        lines.push(serde_json::to_value(finding).expect("is JSON"))
+    };
     let _ = run_checks(&targets, &AtomicBool::new(false), &mut tell);
     Findings::in_lines(lines)
 }

@@ -8,8 +8,8 @@ use crate::early::POST;
 use crate::python::check_on;
 use crate::testkit::{INT, Program, TERM, TestEnv, until};
 use scanhub_client::{Publication, PublishSession, RobotFollower, SensorPublisher};
-use schema::limits::TopicLimits;
-use schema::{Early, Header, Topic, Verdict, Wake, Zones};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Early, Header, Topic, Verdict, Wake, Zones};
 use serde_json::Value;
 
 #[test]

@@ -4,9 +4,9 @@
 #[path = "../testkit/foreground.rs"]
 mod scenes;
 
-use preprocess::background::{Class, Method as Kind, Model, Settings};
 use scanhub_drivers::lms::variant::Unit;
-use schema::{Background, Foreground};
+use scanhub_preprocess::background::{Class, Method as Kind, Model, Settings};
+use scanhub_schema::{Background, Foreground};
 
 use scenes::{Boxes, Detector, Expected, HubDetector, LabeledScan, Scene, Score, play};
 

@@ -10,8 +10,8 @@ use crate::testkit::{
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
-use schema::datagram::{Announce, Datagram, Row, StreamStats};
-use schema::{Background, Topic};
+use scanhub_schema::datagram::{Announce, Datagram, Row, StreamStats};
+use scanhub_schema::{Background, Topic};
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=62", "--baud=500000"];
@@ -153,7 +153,8 @@ fn a_reader_that_does_not_read_delays_nothing() {
         command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
         let mut gateway = spawn(command).expect("a gateway");
         let signal = |signal| gateway.signal(signal).expect("it lives");
-        let is_scan = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
+        let is_scan =
+            |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
         receiver.await_more(3, is_scan);
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
         until("a full pipe", || {
@@ -161,7 +162,8 @@ fn a_reader_that_does_not_read_delays_nothing() {
             poll(&mut [PollFd::new(&writer, PollFlags::OUT)], Some(&now)) == Ok(0)
         });
         // Some seconds of accounts that nobody can be told.
-        let is_announce = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
+        let is_announce =
+            |datagram: &scanhub_schema::datagram::Datagram<'_>| datagram.head.topic == Announce::NUMBER;
         receiver.await_more(3, is_announce);
         signal(USR1);
         receiver.await_more(30, is_scan);
@@ -186,8 +188,9 @@ fn the_account_is_told_when_asked_for() {
         let words = [&["gateway", "--no-system-config"], &flags[..]].concat();
         let mut gateway = env.start(&words);
         gateway.await_text("gateway ");
-        let is_background =
-            |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Background.number();
+        let is_background = |datagram: &scanhub_schema::datagram::Datagram<'_>| {
+            datagram.head.topic == Topic::Background.number()
+        };
         receiver.await_more(3, is_background);
         gateway.signal(USR1);
         gateway.await_text("front/background: ");

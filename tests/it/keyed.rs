@@ -4,8 +4,8 @@ use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
 
 use crate::testkit::{Outcome, Program, Sender, TERM, TestEnv, USR1, in_a_network, is_class, number, read};
-use schema::datagram::{Announce, LanFlags, group};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::datagram::{Announce, LanFlags, group};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=61", "--baud=500000"];

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, Sender, TERM, TestEnv, in_a_network, number, until};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 const ORDER: [&str; 6] = ["min_ns", "p50_ns", "p90_ns", "p99_ns", "p999_ns", "max_ns"];

@@ -10,7 +10,7 @@ use crate::testkit::{
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
 /// The walls of a room, far from the sensor, and in it what `thing` says.

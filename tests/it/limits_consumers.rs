@@ -12,10 +12,10 @@ use crate::testkit::{
 };
 use rustix::process::Signal;
 use scanhub_client::Subscription;
-use schema::{Scan, Topic, Zones, limits};
+use scanhub_schema::{Scan, Topic, Zones, limits};
+use scanhub_shm::Domain;
+use scanhub_shm::Payload;
 use serde_json::Value;
-use shm::Domain;
-use shm::Payload;
 
 /// What a consumer that is killed holds its samples of: the domain's name and where it is.
 const HOLD: [&str; 2] = ["SCANHUB_TEST_DOMAIN", "SCANHUB_TEST_BASE"];
@@ -83,7 +83,7 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
         || {
             let env = TestEnv::new();
             let hub = env.hub(&[env.link("front"), "--set=limits.consumers=3".to_owned()]);
-            let node = shm::client_node(&env.place()).expect("joins");
+            let node = scanhub_shm::client_node(&env.place()).expect("joins");
             let topic = Scan::open(&node, "front").expect("works").expect("is there");
             let subscribers: Vec<_> = (0..3).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
             assert_eq!(env.subscribers("front/scan"), 3);
@@ -110,7 +110,7 @@ fn a_consumer_without_a_place_is_told_the_flag() {
         let flags = ["listen", "--json", "--publish", "--consumers=2", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut program = env.start(&flags).ready();
         sender.await_published(&mut program, &[Topic::Zones, Topic::Status]);
-        let node = shm::client_node(&env.place()).expect("joins");
+        let node = scanhub_shm::client_node(&env.place()).expect("joins");
         let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
         let subscribers = [(); 2].map(|()| Zones::subscriber(&topic).expect("a place"));
         let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
@@ -183,7 +183,7 @@ fn killed_consumers_that_held_samples_leave_nothing() {
 
 /// Takes all the samples that it may hold, says so, and stays.
 fn hold(place: &Domain) {
-    let node = shm::client_node(place).expect("joins");
+    let node = scanhub_shm::client_node(place).expect("joins");
     let topic = Scan::open(&node, "front").expect("works").expect("is there");
     let mut consumers = Vec::new();
     // Those that were killed before have their places until the hub looks after them.

@@ -10,7 +10,7 @@ use crate::testkit::{Outcome, Program, TestEnv};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use rustix::fs::{CWD, FileType, Mode, mknodat};
-use schema::file::ENCODING;
+use scanhub_schema::file::ENCODING;
 
 /// Runs the program with all its address space in 90 MB, of which some 23 are itself, and in two seconds of processor
 /// time, which a program that is not optimized needs for what takes a second.

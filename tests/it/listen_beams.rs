@@ -5,7 +5,7 @@
 use serde_json::{Value, json};
 
 use crate::testkit::{INT, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, sequence};
-use schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic};
+use scanhub_schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic};
 
 /// What both say of one scan, but for what is of the place where it was published.
 fn said(line: &Value) -> Vec<Value> {

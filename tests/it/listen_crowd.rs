@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::testkit::{
     INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, let_pass, number, until,
 };
-use schema::{State, Status, Topic, Verdict, Zones};
+use scanhub_schema::{State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;

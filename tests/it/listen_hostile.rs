@@ -1,8 +1,8 @@
 //! `scanhub listen` against what nobody should send: damaged datagrams of every kind, and words that make no sense.
 
 use crate::testkit::{INT, Program, Sender, TestEnv, in_a_network, number};
-use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
-use schema::{Foreground, Marks, Scan, ScanHead, Status, Topic, Verdict, Zones};
+use scanhub_schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
+use scanhub_schema::{Foreground, Marks, Scan, ScanHead, Status, Topic, Verdict, Zones};
 use serde_json::Value;
 
 const DAMAGED: u64 = 100_000;

@@ -2,7 +2,7 @@
 //! and the account when it is asked.
 
 use crate::testkit::{INT, Robot, Sender, TestEnv, USR1, in_a_network, is_class, number};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::json;
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;

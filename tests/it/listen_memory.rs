@@ -9,7 +9,7 @@ use crate::testkit::{
     INT, Program, Sender, TestEnv, USR1, in_a_network, is_class, let_pass, number, sequence, shared_memory,
     until,
 };
-use schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic, Zones};
+use scanhub_schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic, Zones};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const NAME: &str = "--name=robot1=5f3a12bc00d1e2f3";

@@ -1,7 +1,7 @@
 //! `scanhub listen` against people: tracks and events of another machine are lines like those of this one.
 
 use crate::testkit::{INT, Sender, TestEnv, in_a_network, is_class};
-use schema::{Event, EventKind, Maker, Pose, Topic, Track, TrackSensor, Tracks};
+use scanhub_schema::{Event, EventKind, Maker, Pose, Topic, Track, TrackSensor, Tracks};
 use serde_json::json;
 
 #[test]

@@ -7,8 +7,8 @@ use crate::testkit::{
     INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, let_pass, number, output, until,
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
-use schema::datagram::Announce;
-use schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
+use scanhub_schema::datagram::Announce;
+use scanhub_schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;

@@ -3,19 +3,19 @@
 use std::fs::File;
 use std::path::Path;
 
-use config::{Config, Sources};
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{Family, MILLIS, Nanos, Status};
+use scanhub_schema::{Family, MILLIS, Nanos, Status};
+use scanhub_shm::Payload;
+use scanhub_sim::Arrival;
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::machine::{self, LmsSimulator, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use serde_json::Value;
-use shm::Payload;
-use sim::Arrival;
-use sim::device::Device;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::machine::{self, LmsSimulator, Start};
-use sim::operating::Operating;
-use sim::room::Room;
-use sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 
 use crate::replayed::recorded_rooms::virtual_hub::{VirtualLink, virtual_hub};
 use crate::testkit::{INT, TERM, TestEnv};
@@ -199,7 +199,7 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let unit = RplidarSettings { start: RplidarStart::Streaming, seed: 7, ..RplidarSettings::of(Model::A1) };
     [
         ("ld19", Box::new(LdSimulator::new(head, Packets::Room(Box::new(room()))))),
-        ("lms scanner", Box::new(LmsSimulator::new(machine, sim::operating::Source::Room(room())))),
+        ("lms scanner", Box::new(LmsSimulator::new(machine, scanhub_sim::operating::Source::Room(room())))),
         ("a1", Box::new(RplidarSimulator::new(unit, room()))),
     ]
 }
@@ -243,7 +243,7 @@ fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reporte
     let config = Config::load(&sources).expect("a configuration");
     let domain = env.place();
     let driven = virtual_hub(&config, &domain, |links| {
-        let node = shm::client_node(&domain).expect("a node");
+        let node = scanhub_shm::client_node(&domain).expect("a node");
         let topic = Status::open(&node, "a").expect("a topic").expect("is there");
         let statuses = Status::subscriber(&topic).expect("a subscriber");
         let mut reported = Vec::new();

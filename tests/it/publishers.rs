@@ -5,9 +5,9 @@ use std::io::{PipeWriter, Write};
 use std::process::Command;
 
 use scanhub_client::{PublishSession, Subscription, clock};
-use schema::limits::TopicLimits;
-use schema::{Kind, Maker, Quality, Tilt, Topic};
-use shm::Bell;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Kind, Maker, Quality, Tilt, Topic};
+use scanhub_shm::Bell;
 
 use crate::client_c::installed::{Installed, source};
 use crate::python::check_on;
@@ -84,10 +84,10 @@ fn angles_arrive_with_their_stamps_and_wake_who_sleeps() {
             assert!(followed.try_next().expect("a domain").is_none());
             env.subscribers("mount/tilt") == 1
         });
-        let node = shm::client_node(&env.place()).expect("a domain");
+        let node = scanhub_shm::client_node(&env.place()).expect("a domain");
         let bell = Bell::open(&node, "mount").expect("it is ours").expect("it has one");
-        let wake = shm::open_wake(&node, "mount").expect("it is ours").expect("it has one");
-        let woken = shm::listener(&wake).expect("room for one more");
+        let wake = scanhub_shm::open_wake(&node, "mount").expect("it is ours").expect("it has one");
+        let woken = scanhub_shm::listener(&wake).expect("room for one more");
         let mut lives = Vec::new();
         let begin_ns = clock::now_ns();
         for (number, rate_rad_s) in [0.25, f64::NAN, -1.5].into_iter().enumerate() {
@@ -97,7 +97,7 @@ fn angles_arrive_with_their_stamps_and_wake_who_sleeps() {
             mount.send(&tilt, stamp_ns);
             let ring = |topic: Topic| bell.rung(topic.row().ring).wrapping_sub(rung[topic as usize]);
             assert_eq!([Topic::Tilt, Topic::Scan, Topic::Early].map(ring), [1, 0, 0]);
-            assert_eq!(shm::take_wakeups(&[&woken]), Ok(true));
+            assert_eq!(scanhub_shm::take_wakeups(&[&woken]), Ok(true));
             let sample = followed.next().expect("a domain").expect("it was sent");
             assert_eq!((sample.angle_rad, sample.rate_rad_s()), (tilt.angle_rad, tilt.rate_rad_s()));
             let header = *sample.header();
@@ -178,7 +178,7 @@ fn who_comes_while_another_goes_is_found() {
                     let topics = Maker::Mount.topics();
                     let sensor = PublishSession::beside(place, name, topics, TopicLimits::default());
                     let mount = sensor.expect("the name is free").topic::<Tilt>().expect("it is alone");
-                    let published = shm::published(place).expect("a domain");
+                    let published = scanhub_shm::published(place).expect("a domain");
                     assert!(published.contains(&(name.to_owned(), Topic::Tilt)), "{name} in {round}");
                     drop(mount);
                 }

@@ -9,7 +9,7 @@ use std::process::Command;
 use crate::testkit::{
     INT, KILL, Outcome, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, python, until,
 };
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 /// A script of the package's tests, if there is a Python for it.

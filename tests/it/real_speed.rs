@@ -6,9 +6,9 @@ mod judges;
 mod sensors;
 mod stage;
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
+use scanhub_world::Plan;
 use stage::Stage;
-use world::Plan;
 
 /// The list that is played if none is named.
 const SEED: u64 = 7;

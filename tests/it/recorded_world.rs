@@ -6,11 +6,11 @@ use std::fs::File;
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Header, Tilt, Topic};
-use sim::room::Room;
-use sim::world::World;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Header, Tilt, Topic};
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 use crate::testkit::TestEnv;
 

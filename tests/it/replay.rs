@@ -6,9 +6,9 @@ use crate::testkit;
 use crate::testkit::{INT, Outcome, Program, Sitting, TERM, TestEnv, is_class, number};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Header, Marks, Topic};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Header, Marks, Topic};
 use serde_json::Value;
 
 /// A log with a scan every `period_ms`, from 1000 s on.

@@ -6,9 +6,9 @@ use std::path::Path;
 
 use crate::testkit::Recording;
 use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number};
-use schema::datagram::Packed;
-use schema::file::{self, Writer};
-use schema::{Family, Flags, Header, Reasons, Scan, Topic};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{self, Writer};
+use scanhub_schema::{Family, Flags, Header, Reasons, Scan, Topic};
 use serde_json::Value;
 
 /// A recorder of `flags` that is attached.

@@ -1,7 +1,7 @@
 //! Recordings of scanners that are asked what they are, begun while they streamed already: nobody asks in them any more. The
 //! status that a hub published tells how the packets are to be read.
 
-use schema::Header;
+use scanhub_schema::Header;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, TERM, TestEnv, is_class};

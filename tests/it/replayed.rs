@@ -11,10 +11,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{PATIENCE, TestEnv, in_own_process};
-use config::Sources;
-use daemon::{PlaybackOptions, Player, Replay};
 use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
-use schema::{Flags, Topic};
+use scanhub_config::Sources;
+use scanhub_daemon::{PlaybackOptions, Player, Replay};
+use scanhub_schema::{Flags, Topic};
 
 const SCANS: u64 = 400;
 /// Before this scan nothing is heard of a sensor for a second.
@@ -45,10 +45,10 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
     let (tell, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
-            daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+            scanhub_daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
         });
         let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
-        let node = shm::client_node(&domain).expect("a node");
+        let node = scanhub_shm::client_node(&domain).expect("a node");
         let followers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         let mut published = vec![Vec::new(), Vec::new()];
         let mut telegrams = 0;

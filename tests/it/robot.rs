@@ -3,7 +3,7 @@
 
 use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, until};
 use scanhub_client::{Robot, RobotFollower};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 /// So near that nothing in the simulated room is inside.

@@ -7,8 +7,8 @@ use std::process::Command;
 use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, output, python};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::Unit;
-use schema::datagram::Packed;
-use schema::{Code, Header, Pose, Scan, file};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;
 
 /// Two sensors with poses, of which one hangs upside down.

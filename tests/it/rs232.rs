@@ -8,12 +8,12 @@ use std::sync::mpsc::{Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use schema::Failure;
+use scanhub_schema::Failure;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::options::SimulateOptions;
+use scanhub_sim::simulate::Summary;
+use scanhub_sim::{Event, simulate_with};
 use serde_json::Value;
-use sim::fault::Faults;
-use sim::options::SimulateOptions;
-use sim::simulate::Summary;
-use sim::{Event, simulate_with};
 
 use crate::testkit::{PATIENCE, TERM, TestEnv, is_class};
 

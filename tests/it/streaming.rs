@@ -8,7 +8,7 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::framer::{Found, Framer};
 use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::telegram::Telegram;
-use schema::Topic;
+use scanhub_schema::Topic;
 use serde_json::Value;
 
 #[test]

@@ -5,7 +5,7 @@
 use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until};
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
-use schema::{Topic, Verdict, Zones};
+use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
 #[test]

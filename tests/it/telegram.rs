@@ -4,7 +4,6 @@
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
-use lms_configure::eeprom::{PowerOn, Write};
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::configuration::{self, Configuration};
 use scanhub_drivers::lms::errors::Errors;
@@ -14,6 +13,7 @@ use scanhub_drivers::lms::parameters::{Password, Raw, Span, Spans};
 use scanhub_drivers::lms::reply::{self, Health, Reply};
 use scanhub_drivers::lms::telegram::Encoded;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use scanhub_lms_configure::eeprom::{PowerOn, Write};
 use serde_json::Value;
 
 use crate::testkit::spawn;

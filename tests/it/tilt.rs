@@ -4,9 +4,9 @@
 use std::cell::Cell;
 
 use scanhub_client::Subscription;
-use schema::Tilt;
+use scanhub_schema::Tilt;
+use scanhub_sim::world::World;
 use serde_json::Value;
-use sim::world::World;
 
 use crate::pages::{commands_on, programs_on};
 use crate::publishers::{Mount, languages};

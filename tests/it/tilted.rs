@@ -5,9 +5,11 @@ use std::cell::RefCell;
 use std::path::Path;
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher};
-use schema::datagram::Packed;
-use schema::limits::TopicLimits;
-use schema::{Cloud, CloudHead, CloudPoint, Header, Maker, Obstacle, Obstacles, PointClass, Tilt, Wake};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{
+    Cloud, CloudHead, CloudPoint, Header, Maker, Obstacle, Obstacles, PointClass, Tilt, Wake,
+};
 use serde_json::{Value, json};
 
 use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, in_a_network, number, python, until};

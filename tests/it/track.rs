@@ -9,12 +9,12 @@ use std::thread;
 use crate::pages::programs_on;
 use crate::recorded_world::{BEGIN_NS, recorded_world};
 use crate::testkit::{INT, PATIENCE, Program, TERM, TestEnv, in_own_process, is_class, number, until};
-use config::Sources;
-use daemon::{PlaybackOptions, Player, Replay};
-use schema::datagram::Packed;
-use schema::{Event, EventKind, TrackState, Tracks};
-use shm::{Node, Payload, Subscriber};
-use sim::world::World;
+use scanhub_config::Sources;
+use scanhub_daemon::{PlaybackOptions, Player, Replay};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Event, EventKind, TrackState, Tracks};
+use scanhub_shm::{Node, Payload, Subscriber};
+use scanhub_sim::world::World;
 
 pub(crate) const SITE: &str = r#"
 [[sensor]]
@@ -156,13 +156,13 @@ fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
     let (tell, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
-            daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+            scanhub_daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
         });
         let player = EndsPlayer(ready.recv_timeout(PATIENCE).expect("is up"));
         let delay = format!("--delay={}ms", DELAY_NS / 1_000_000);
         let track = env.start(&["track", "--site", site, "--as=house", &delay, "--json"]);
         await_follower(env);
-        let node = shm::client_node(&domain).expect("a node");
+        let node = scanhub_shm::client_node(&domain).expect("a node");
         let telegrams = ["hall", "kitchen"].map(|sensor| attach::<[u8]>(&node, sensor));
         let (tracks, events) = (attach::<Tracks>(&node, "house"), attach::<Event>(&node, "house"));
         let (mut published, mut played_ns) = ([Published::new(), Published::new()], 0);
@@ -230,7 +230,7 @@ fn packed(payload: &impl Packed) -> Vec<u8> {
 
 #[test]
 fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
-    in_own_process("track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
+    in_own_process("scanhub_track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
         let env = TestEnv::new();
         let site = env.file("site.toml", SITE);
         let file = recorded(&env, 22);

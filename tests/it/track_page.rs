@@ -4,7 +4,7 @@
 use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
 use crate::testkit::{INT, Program, TERM, TestEnv, in_a_network, is_class, number, until};
-use sim::world::World;
+use scanhub_sim::world::World;
 
 const PAGE: &str = "docs/tracks.md";
 

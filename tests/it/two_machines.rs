@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::testkit::{
     INT, Machine, Outcome, Program, Relay, Robot, TERM, TestEnv, in_a_network, is_class, number, read, until,
 };
-use schema::Topic;
-use schema::datagram::Announce;
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::Announce;
 use serde_json::Value;
 
 /// Passed on while the network is rough: some seconds.

@@ -8,13 +8,13 @@ use std::thread;
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::Device;
+use scanhub_sim::port::Pty;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
+use scanhub_sim::world::World;
 use serde_json::Value;
-use sim::Arrival;
-use sim::device::Device;
-use sim::port::Pty;
-use sim::room::Room;
-use sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
-use sim::world::World;
 
 use crate::testkit::{Program, python_for};
 

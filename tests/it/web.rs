@@ -158,7 +158,7 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
         let body = &frame[13..];
         match subscription {
             70 => {
-                let told = ros::read(&ros::LASER_SCAN, body).expect("a LaserScan");
+                let told = scanhub_ros::read(&scanhub_ros::LASER_SCAN, body).expect("a LaserScan");
                 assert_eq!(told.text("header.frame_id"), Some("front"));
                 assert!(told.number("ranges.0").is_some());
                 seen[0] += 1;

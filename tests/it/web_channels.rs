@@ -5,8 +5,8 @@ use std::collections::HashMap;
 use std::net::TcpStream;
 use std::time::Instant;
 
-use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value as Told, read};
-use schema::Pose;
+use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value as Told, read};
+use scanhub_schema::Pose;
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 

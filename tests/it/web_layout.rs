@@ -9,7 +9,7 @@ use crate::recorded_world::recorded_world;
 use crate::testkit::{INT, Program, TestEnv, until};
 use crate::web::web;
 use crate::web_page::browse;
-use sim::world::World;
+use scanhub_sim::world::World;
 
 /// Widths of a phone, a small laptop and a large one, with their heights.
 const SIZES: [(u32, u32); 3] = [(390, 844), (1024, 768), (1440, 900)];

@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::browser::{Browser, Look};
 use crate::recorded_world::recorded_world;
 use crate::testkit::{INT, KILL, Program, TestEnv, skip, until};
-use sim::world::World;
+use scanhub_sim::world::World;
 
 /// A hall with a reflector, and a post that is put beside the robot when its background is learned.
 const WORLD: &str =

@@ -5,7 +5,7 @@ use std::net::TcpStream;
 use std::path::Path;
 use std::process::Command;
 
-use ros::{POINT_CLOUD, Value as Told, read};
+use scanhub_ros::{POINT_CLOUD, Value as Told, read};
 use serde_json::Value;
 use tungstenite::{Message, WebSocket};
 

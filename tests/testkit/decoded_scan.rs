@@ -2,7 +2,7 @@
 
 use scanhub_drivers::lms::measured::{self, Measured};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::Scan;
+use scanhub_schema::Scan;
 
 /// Measuring mode of the scans: 13 bits of range, 3 of intensity.
 pub(crate) const MODE: Mode = Mode(1);

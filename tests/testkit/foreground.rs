@@ -6,13 +6,13 @@ mod decoded_scan;
 
 use std::ops::AddAssign;
 
-use preprocess::background::{Class, Model, Settings};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use schema::{Foreground, Scan};
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_preprocess::background::{Class, Model, Settings};
+use scanhub_schema::{Foreground, Scan};
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 /// A scene of the simulated world: 2000 scans, 53 s.
 #[derive(Clone, Copy)]

@@ -31,8 +31,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use scanhub_shm::Domain;
 use serde_json::Value;
-use shm::Domain;
 use tempfile::TempDir;
 
 pub(crate) use again::{in_own_process, only, own_program, run_again};

@@ -7,7 +7,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use rustix::net::sockopt::set_socket_recv_buffer_size_force;
-use schema::datagram::{Datagram, GROUPS, PORT};
+use scanhub_schema::datagram::{Datagram, GROUPS, PORT};
 
 use super::until;
 

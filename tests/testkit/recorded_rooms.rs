@@ -8,16 +8,16 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
-use config::{Config, Sources};
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Background, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
-use shm::Domain;
-use shm::{Node, Payload, Subscriber};
-use sim::room::Room;
-use sim::world::World;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Background, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
+use scanhub_shm::Domain;
+use scanhub_shm::{Node, Payload, Subscriber};
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 /// Names of the sensors, and their worlds.
 pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
@@ -48,7 +48,7 @@ pub(crate) fn record(
     let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
     let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
     let driven = virtual_hub::virtual_hub(&config, domain, |links| {
-        let node = shm::client_node(domain).expect("a node");
+        let node = scanhub_shm::client_node(domain).expect("a node");
         let subscribers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         for scan in 0..=scans {
             for (number, room) in rooms.iter().enumerate() {
@@ -143,4 +143,4 @@ fn packed(payload: &(impl Packed + ?Sized)) -> Vec<u8> {
     room
 }
 
-const SECOND: Nanos = 1_000 * schema::MILLIS;
+const SECOND: Nanos = 1_000 * scanhub_schema::MILLIS;

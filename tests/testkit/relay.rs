@@ -9,8 +9,8 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::{self, JoinHandle};
 
 use rustix::net::sockopt::set_ip_multicast_if;
-use schema::Topic;
-use schema::datagram::{Announce, GROUPS, PORT, group};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, GROUPS, PORT, group};
 
 use super::{Machine, Receiver, read, until};
 

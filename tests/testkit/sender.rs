@@ -3,10 +3,10 @@
 use std::net::{Ipv4Addr, UdpSocket};
 
 use rustix::net::sockopt::set_ip_multicast_if;
-use schema::datagram::{
+use scanhub_schema::datagram::{
     Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PART_LONGEST, PORT, Packed, group,
 };
-use schema::{Family, Status, Topic};
+use scanhub_schema::{Family, Status, Topic};
 use serde_json::Value;
 
 use super::{Program, until};

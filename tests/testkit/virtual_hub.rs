@@ -8,14 +8,14 @@ use std::io;
 use std::path::Path;
 use std::rc::Rc;
 
-use config::Config;
-use daemon::platform::{Line, Platform, SavedState, Wait, WakeReason};
-use daemon::{CommandSender, LiveLink};
-use port::{Allowance, Alteration, PortError, Source, clock};
-use schema::limits::TopicLimits;
-use schema::{Failure, Nanos, Ring, Wake};
-use shm::{Domain, HubLock, shortage};
-use shm::{Node, Payload, SharedMemory, Waker};
+use scanhub_config::Config;
+use scanhub_daemon::platform::{Line, Platform, SavedState, Wait, WakeReason};
+use scanhub_daemon::{CommandSender, LiveLink};
+use scanhub_port::{Allowance, Alteration, PortError, Source, clock};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Nanos, Ring, Wake};
+use scanhub_shm::{Domain, HubLock, shortage};
+use scanhub_shm::{Node, Payload, SharedMemory, Waker};
 
 /// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
 /// are read in the configured mode.
@@ -37,7 +37,7 @@ pub(crate) fn virtual_hub<T>(
 ) -> Result<T, Failure> {
     shortage::raise_descriptor_limit().expect("a limit can be raised");
     let _lock = HubLock::acquire(domain.root())?;
-    let node = shm::hub_node(domain)?;
+    let node = scanhub_shm::hub_node(domain)?;
     let (_commands, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;
     let platform = config.links.iter().map(|link| VirtualPlatform::new(&node, &link.name));
     let platform = platform.collect::<Result<Vec<_>, _>>()?;
@@ -47,7 +47,7 @@ pub(crate) fn virtual_hub<T>(
         let Wait { until, .. } = link.on_wakeup(WakeReason::Timeout);
         links.push(VirtualLink { platform, link, until });
     }
-    shm::allocate(domain)?;
+    scanhub_shm::allocate(domain)?;
     Ok(drive(&mut links))
 }
 

@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Session, Source};
 use scanhub_client::{Flags, Topic, clock};
-use schema::datagram::{Datagram, HEAD, Head};
+use scanhub_schema::datagram::{Datagram, HEAD, Head};
 use serde_json::Value;
 use socket2::{Domain, Protocol, Socket, Type};
 use zenoh::Wait;

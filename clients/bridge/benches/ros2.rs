@@ -11,9 +11,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use ros::{LASER_SCAN, read};
 use scanhub_client::streams::Sample;
 use scanhub_client::{Topic, clock};
+use scanhub_ros::{LASER_SCAN, read};
 use zenoh::Wait;
 
 use stage::{SENSORS, Stage, Times, free_port, listened, percentile, session};
@@ -83,7 +83,7 @@ fn measure(stage: &Stage, run_for: Duration) {
                 sent.insert((is_front, stamp_ns), sent_ns);
                 count += 1;
                 message.clear();
-                ros::laser_scan(&mut message, "front", &header, scan);
+                scanhub_ros::laser_scan(&mut message, "front", &header, scan);
                 let now_ns = clock::now_ns().to_le_bytes();
                 publisher.put(&message[..]).attachment(&now_ns[..]).wait().expect("to send");
             }

@@ -9,11 +9,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use lan::address::{Address, LIVE, PREFIX, live};
-use schema::datagram::{Datagram, DatagramError};
-use schema::{Failure, Kind, Printable};
+use scanhub_lan::address::{Address, LIVE, PREFIX, live};
+use scanhub_schema::datagram::{Datagram, DatagramError};
+use scanhub_schema::{Failure, Kind, Printable};
+use scanhub_verbs::network::{now, quiet};
 use serde::Serialize;
-use verbs::network::{now, quiet};
 
 use crate::diagnosis::{Diagnosis, UNREACHED};
 use crate::session::{CheckedConfig, Connection, LinkEvent, ZenohSession};

@@ -19,11 +19,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use lan::outgoing::ANNOUNCE_EVERY;
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, Topic};
-use shm::Domain;
-use verbs::network::{End, LossyWriter, Output, now, quiet};
+use scanhub_lan::outgoing::ANNOUNCE_EVERY;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::network::{End, LossyWriter, Output, now, quiet};
 
 pub use check::check;
 use report::Report;

@@ -8,14 +8,14 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use bridge::{BridgeOptions, PublishOptions, Ros2Options, SendOptions, bridge, check};
 use clap::Parser;
-use ros::Names;
-use ros::zenoh_wire::Distro;
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, Printable};
-use shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
-use verbs::network::received_topics;
+use scanhub_bridge::{BridgeOptions, PublishOptions, Ros2Options, SendOptions, bridge, check};
+use scanhub_ros::Names;
+use scanhub_ros::zenoh_wire::Distro;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, Printable};
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
+use scanhub_verbs::network::received_topics;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
 #[derive(Debug, Parser)]
@@ -134,7 +134,7 @@ impl Cli {
                 let what = format!("--frame: {sensor} has two frames");
                 return Err(Failure::new(Kind::Usage, what, "name each sensor once"));
             }
-            if frame == ros::BASE_FRAME {
+            if frame == scanhub_ros::BASE_FRAME {
                 let what = format!("--frame: {sensor}={frame} is the frame of the robot itself");
                 return Err(Failure::new(Kind::Usage, what, "give the sensor a frame of its own"));
             }
@@ -193,7 +193,7 @@ fn main() -> ExitCode {
         Err(failure) => {
             // Whoever closed them does not want it.
             let _ = match json {
-                true => writeln!(io::stdout(), "{}", Printable(&verbs::error_line(&failure))),
+                true => writeln!(io::stdout(), "{}", Printable(&scanhub_verbs::error_line(&failure))),
                 false => writeln!(io::stderr(), "scanhub-bridge: {}", Printable(&failure.to_string())),
             };
             ExitCode::from(failure.kind.exit_code())

@@ -8,11 +8,11 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use lan::Stamp;
-use lan::outgoing::Sample;
-use schema::{Failure, Topic};
-use shm::Domain;
-use verbs::network::{Carrier, End, Forwarder, Notice, Selection, now};
+use scanhub_lan::Stamp;
+use scanhub_lan::outgoing::Sample;
+use scanhub_schema::{Failure, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::network::{Carrier, End, Forwarder, Notice, Selection, now};
 
 use crate::session::{Connection, ZenohSession};
 

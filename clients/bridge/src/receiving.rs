@@ -9,10 +9,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use lan::address::{ANNOUNCE, Address, LIVE, PREFIX, live};
-use schema::datagram::{Datagram, HEAD, MAC};
-use schema::{Failure, Topic};
-use verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
+use scanhub_lan::address::{ANNOUNCE, Address, LIVE, PREFIX, live};
+use scanhub_schema::datagram::{Datagram, HEAD, MAC};
+use scanhub_schema::{Failure, Topic};
+use scanhub_verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
 
 use crate::PublishOptions;
 use crate::session::{Connection, Subscriber, ZenohSession};

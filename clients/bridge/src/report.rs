@@ -3,8 +3,8 @@
 
 use std::io::Write;
 
+use scanhub_verbs::network::{End, Notice, Output, tell};
 use serde::Serialize;
-use verbs::network::{End, Notice, Output, tell};
 
 use crate::BridgeOptions;
 use crate::diagnosis::Diagnosis;

@@ -10,14 +10,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use lan::Stamp;
-use lan::outgoing::Sample;
-use ros::Names;
-use ros::zenoh_wire::{self, Distro, Node, Qos};
-use schema::{Failure, Topic};
+use scanhub_lan::Stamp;
+use scanhub_lan::outgoing::Sample;
+use scanhub_ros::Names;
+use scanhub_ros::zenoh_wire::{self, Distro, Node, Qos};
+use scanhub_schema::{Failure, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::network::{Carrier, End, Output, Selection, now, tell};
 use serde::Serialize;
-use shm::Domain;
-use verbs::network::{Carrier, End, Output, Selection, now, tell};
 
 use crate::queue::{self, Follower, Queue, Sender, Shared};
 use crate::session::{Connection, Publisher, Queryable, Reply, Token, ZenohSession};
@@ -49,7 +49,7 @@ const MAX_WAIT: Duration = Duration::from_millis(50);
 ///
 /// # Errors
 ///
-/// [`Kind::Usage`](schema::Kind) if there is no such topic, [`Kind::NoTopic`](schema::Kind) if the first hub has no such sensor.
+/// [`Kind::Usage`](scanhub_schema::Kind) if there is no such topic, [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub has no such sensor.
 pub(crate) fn run(
     options: &Ros2Options,
     json: bool,

@@ -6,12 +6,12 @@ use std::collections::hash_map::Entry;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use lan::Stamp;
-use lan::address::{Address, LIVE, PREFIX};
-use lan::outgoing::{Outgoing, Sample, Transmit};
-use schema::{Failure, Topic};
-use shm::Domain;
-use verbs::network::{Carrier, End, Life, Output, Selection, account, begin_life, now};
+use scanhub_lan::Stamp;
+use scanhub_lan::address::{Address, LIVE, PREFIX};
+use scanhub_lan::outgoing::{Outgoing, Sample, Transmit};
+use scanhub_schema::{Failure, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::network::{Carrier, End, Life, Output, Selection, account, begin_life, now};
 
 use crate::SendOptions;
 use crate::queue::{Follower, Queue, Sender, Shared};

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 use zenoh::config::WhatAmI;
 use zenoh::key_expr::KeyExpr;
 use zenoh::liveliness::LivelinessToken;

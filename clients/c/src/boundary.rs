@@ -6,7 +6,7 @@ use std::ffi::{CStr, c_char, c_int, c_void};
 use std::mem::MaybeUninit;
 use std::ptr;
 
-use schema::Header;
+use scanhub_schema::Header;
 
 use crate::call_error::CallError;
 use crate::table::Opaque;

@@ -4,7 +4,7 @@
 use std::cell::RefCell;
 use std::ffi::{CString, c_char, c_int};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// A call that did not succeed.
 pub(crate) enum CallError {

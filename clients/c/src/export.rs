@@ -7,7 +7,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
 use scanhub_client::{Wait, places};
-use schema::{Tilt, Topic};
+use scanhub_schema::{Tilt, Topic};
 
 use crate::boundary::{Lent, place, sample, text};
 use crate::call_error::{self, CallError};

@@ -6,7 +6,7 @@ use std::ptr;
 use std::time::{Duration, Instant};
 
 use scanhub_client::{Domain, Heard, Payload, Received, RobotFollower, Subscription, Wait, ZonesFollower};
-use schema::{Failure, Header, Topic, limits};
+use scanhub_schema::{Failure, Header, Topic, limits};
 
 use crate::boundary::Lent;
 use crate::call_error::CallError;
@@ -30,7 +30,7 @@ macro_rules! follower {
         ZonesFollower
     };
     ($topic:ident $payload:tt) => {
-        Subscription<schema::payload_type!($payload)>
+        Subscription<scanhub_schema::payload_type!($payload)>
     };
 }
 
@@ -40,7 +40,7 @@ macro_rules! sample {
         Heard
     };
     ($topic:ident $payload:tt) => {
-        Received<schema::payload_type!($payload)>
+        Received<scanhub_schema::payload_type!($payload)>
     };
 }
 
@@ -100,7 +100,7 @@ macro_rules! topics {
     };
 }
 
-schema::for_each_topic!(topics);
+scanhub_schema::for_each_topic!(topics);
 
 /// What a program in C sees of a sample.
 trait Lend {

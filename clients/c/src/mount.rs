@@ -1,7 +1,7 @@
 //! The angles of a mount as C publishes them. Refuses to know who follows them.
 
 use scanhub_client::{Publication, home};
-use schema::Tilt;
+use scanhub_schema::Tilt;
 
 use crate::call_error::CallError;
 

@@ -38,7 +38,7 @@ impl Told {
         // Names have no 0 in them.
         let names: Vec<CString> =
             robot.zones().map(|(name, _)| CString::new(name).unwrap_or_default()).collect();
-        let of_sensor = |((_, zones), name): ((&str, &schema::Zones), &CString)| OfSensor {
+        let of_sensor = |((_, zones), name): ((&str, &scanhub_schema::Zones), &CString)| OfSensor {
             name: name.as_ptr(),
             verdict: zones.verdict() as u8,
             nearest_mm: zones.nearest().map_or(NOTHING_MM, |(_, mm)| mm),

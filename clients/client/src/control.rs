@@ -4,9 +4,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind, Request, Shown};
-use shm::{ControlClient, Node};
-use shm::{Domain, holder};
+use scanhub_schema::{Failure, Kind, Request, Shown};
+use scanhub_shm::{ControlClient, Node};
+use scanhub_shm::{Domain, holder};
 
 use crate::presence::{GRACE, find};
 
@@ -35,7 +35,7 @@ use crate::presence::{GRACE, find};
 /// [`Kind::Interrupted`] if `stop` is set.
 pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Failure> {
     let domain = find(places)?;
-    let node = shm::client_node(&domain)?;
+    let node = scanhub_shm::client_node(&domain)?;
     ask(&open(&node)?, &domain, request, stop)
 }
 
@@ -62,7 +62,7 @@ fn ask(
     let pending = client.ask(request)?;
     let give_up_at = Instant::now() + PATIENCE;
     loop {
-        shm::take_wakeups(&[client.responses()])?;
+        scanhub_shm::take_wakeups(&[client.responses()])?;
         // In this order: what was answered before the hub went is an answer.
         let lives = pending.is_open() && holder(domain.root())?.is_some();
         if let Some(response) = pending.response()? {
@@ -84,7 +84,7 @@ fn ask(
             );
             return Err(Failure::new(Kind::Timeout, message, hint));
         }
-        shm::sleep(&[client.responses()], LOOK_EVERY)?;
+        scanhub_shm::sleep(&[client.responses()], LOOK_EVERY)?;
     }
 }
 

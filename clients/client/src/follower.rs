@@ -4,8 +4,8 @@
 use std::ops::Deref;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Header, Kind, Scan};
-use shm::{Payload, ReceiveError, Sample, Subscriber};
+use scanhub_schema::{Failure, Header, Kind, Scan};
+use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber};
 
 use crate::numbers::{Noted, Numbers};
 use crate::session::Session;

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use schema::{Flags, Header, Verdict};
+use scanhub_schema::{Flags, Header, Verdict};
 
 use crate::clock::Moment;
 

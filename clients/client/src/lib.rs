@@ -56,14 +56,14 @@ pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};
 
 /// The types of topics and payloads: a program needs no second dependency.
-pub use schema::{
+pub use scanhub_schema::{
     Age, BEAMS, Background, Cloud, CloudHead, CloudPoint, Code, Corner, Counter, Counters, Early, Event,
     EventKind, Failure, Flags, Foreground, Header, Kind, LINES, Line, Lines, MARKS, Mark, Marks, Motion,
     MotionMethod, OBSTACLES, Obstacle, Obstacles, PointClass, Pose, Quality, ROBOT, Reasons, Request,
     SEGMENTS, Scan, Segment, Shown, State, Status, SweepPoints, TRACKS, Telegram, Tilt, Topic, Track,
     TrackState, Tracks, Verb, Verdict, Wake, ZONES, Zone, Zones,
 };
-pub use shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
+pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]

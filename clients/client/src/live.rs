@@ -1,7 +1,7 @@
 //! Which sensors and topics exist at this moment, for callers that want no failure and do not wait.
 
-use schema::Failure;
-use shm::{Domain, publisher};
+use scanhub_schema::Failure;
+use scanhub_shm::{Domain, publisher};
 
 /// Returns the sensors of the hub at the first live one of `places`, for who wants no failure; never waits.
 ///
@@ -15,12 +15,12 @@ use shm::{Domain, publisher};
 /// # Ok::<(), scanhub_client::Failure>(())
 /// ```
 pub fn live_sensors(places: &[Domain]) -> Vec<String> {
-    live(places, shm::sensors)
+    live(places, scanhub_shm::sensors)
 }
 
 /// Returns the topics of each of [`live_sensors`] as `SENSOR/TOPIC`.
 pub fn live_topics(places: &[Domain]) -> Vec<String> {
-    let mut topics = live(places, shm::published);
+    let mut topics = live(places, scanhub_shm::published);
     topics.sort();
     topics.into_iter().map(|(sensor, topic)| format!("{sensor}/{}", topic.name())).collect()
 }

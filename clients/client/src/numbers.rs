@@ -1,7 +1,7 @@
 //! What the numbers of a topic's samples tell a consumer: how many it missed, and that the hub was restarted. Refuses to know
 //! how samples come.
 
-use schema::{Flags, Header};
+use scanhub_schema::{Flags, Header};
 
 /// The numbers of one topic of one sensor, as one consumer meets them.
 #[derive(Clone, Debug, Default)]

@@ -4,8 +4,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind};
-use shm::{Domain, Environment, RunningHub, holder, publisher};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::{Domain, Environment, RunningHub, holder, publisher};
 
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);

@@ -8,11 +8,13 @@ use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
 use std::rc::{Rc, Weak};
 
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
-use shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
-use shm::{DEFAULT_DOMAIN, Domain, Environment, ListenLock, NameLock, holder, name_held, publisher_domain};
-use shm::{DueRings, Node, Payload, TopicPublisher, Waker};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
+use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
+use scanhub_shm::{
+    DEFAULT_DOMAIN, Domain, Environment, ListenLock, NameLock, holder, name_held, publisher_domain,
+};
+use scanhub_shm::{DueRings, Node, Payload, TopicPublisher, Waker};
 
 pub use publication::Publication;
 
@@ -53,7 +55,7 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failur
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](schema::Kind) if the name is not possible.
+/// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible.
 pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
     let of_process = std::env::var("SCANHUB_DOMAIN");
     let name = domain.unwrap_or(of_process.as_deref().unwrap_or(DEFAULT_DOMAIN));
@@ -97,15 +99,15 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](schema::Kind) if another process (or another session of this one) has it: the message has its
-    /// number; [`Kind::Configuration`](schema::Kind) if the limits are none of those that can be;
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are short; [`Kind::Failed`](schema::Kind) if the directory is
+    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another process (or another session of this one) has it: the message has its
+    /// number; [`Kind::Configuration`](scanhub_schema::Kind) if the limits are none of those that can be;
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the directory is
     /// another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, shm::hub_node(domain)?, lock))
+        Ok(PublishSession::with(domain, limits, scanhub_shm::hub_node(domain)?, lock))
     }
 
     /// Publishes as `name`, beside a hub or a listener if there is one, of which it takes no place: for what is made of the
@@ -114,8 +116,8 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](schema::Kind) if another process publishes as `name`: a program, or the hub whose sensor
-    /// it is. The message names the process. Returns [`Kind::Configuration`](schema::Kind) if the name is invalid, or if
+    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes as `name`: a program, or the hub whose sensor
+    /// it is. The message names the process. Returns [`Kind::Configuration`](scanhub_schema::Kind) if the name is invalid, or if
     /// subscribers still wait for a sensor of this name after its hub has ended. Otherwise the errors of
     /// [`open`](Self::open) and [`sensor`](Self::sensor).
     pub fn beside(
@@ -129,7 +131,7 @@ impl PublishSession {
         let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
         let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
-        if shm::published(domain)?.iter().any(of_hub) {
+        if scanhub_shm::published(domain)?.iter().any(of_hub) {
             // A hub that is starting, or that has waited for this name, takes it now.
             if let Some(pid) = holder(domain.root())? {
                 return Err(name_held(name, pid));
@@ -137,7 +139,7 @@ impl PublishSession {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
         }
-        PublishSession::with(domain, limits, shm::hub_node(domain)?, lock).sensor(name)
+        PublishSession::with(domain, limits, scanhub_shm::hub_node(domain)?, lock).sensor(name)
     }
 
     fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {
@@ -156,7 +158,7 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) with what is free and what is needed.
+    /// [`Kind::Short`](scanhub_schema::Kind) with what is free and what is needed.
     pub fn check_room(&self, topics: &[Topic]) -> Result<(), Failure> {
         check_topics(topics, &self.0.limits)?;
         check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)
@@ -167,8 +169,8 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if the name is not possible; [`Kind::Short`](schema::Kind) if memory or
-    /// descriptors are short; [`Kind::Failed`](schema::Kind) if the place is taken by another user.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible; [`Kind::Short`](scanhub_schema::Kind) if memory or
+    /// descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
         check_followed(name)?;
         let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
@@ -211,9 +213,9 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Configuration`](schema::Kind) if only
-    /// sensors have the topic, and the name has no dot; [`Kind::Short`](schema::Kind) if memory or descriptors are short;
-    /// [`Kind::Failed`](schema::Kind) if the topic exists with another layout.
+    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if this process publishes it already; [`Kind::Configuration`](scanhub_schema::Kind) if only
+    /// sensors have the topic, and the name has no dot; [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short;
+    /// [`Kind::Failed`](scanhub_schema::Kind) if the topic exists with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
         self.topic_for(self.limits())
     }
@@ -238,7 +240,7 @@ impl SensorPublisher {
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
-        shm::allocate(domain)?;
+        scanhub_shm::allocate(domain)?;
         Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
 
@@ -252,7 +254,7 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`](schema::Kind) if some were not woken; these look by themselves ten times a second.
+    /// [`Kind::Failed`](scanhub_schema::Kind) if some were not woken; these look by themselves ten times a second.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
         let mut due = self.0.due.take();
         Ring::ALL.into_iter().filter(|&ring| due.take(ring)).for_each(|ring| self.0.waker.ring(ring));

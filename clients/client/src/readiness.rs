@@ -9,7 +9,7 @@ use rustix::io::Errno;
 use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// An epoll descriptor over events, which come and go, and a clock.
 pub(crate) struct Readiness {

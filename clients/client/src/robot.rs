@@ -5,8 +5,8 @@ mod source;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Failure, Verdict, Zones, check_followed};
-use shm::Domain;
+use scanhub_schema::{Failure, Verdict, Zones, check_followed};
+use scanhub_shm::Domain;
 
 use crate::session::Session;
 use crate::subscribe::places;
@@ -32,7 +32,7 @@ pub use source::{RobotHeard, RobotSource};
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
 pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
     RobotFollower::in_domain(places(None)?, sensors)
 }
@@ -100,7 +100,7 @@ impl RobotFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if a sensor's name is not possible.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if a sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
         sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
@@ -111,7 +111,7 @@ impl RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Takes early warnings too ([`Early`](schema::Early)): the verdict becomes worse before a scan is complete, and is taken
+    /// Takes early warnings too ([`Early`](scanhub_schema::Early)): the verdict becomes worse before a scan is complete, and is taken
     /// back if that does not come to be. To be said before the first wait.
     pub fn with_early(self) -> RobotFollower {
         RobotFollower { source: self.source.with_early(), ..self }
@@ -161,7 +161,7 @@ impl RobotFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use bytemuck::bytes_of;
-use schema::datagram::Packed;
-use schema::{Failure, Header, ROBOT, Topic};
-use shm::Payload;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Failure, Header, ROBOT, Topic};
+use scanhub_shm::Payload;
 
 use crate::follower::{Follower, Received};
 use crate::robot::{RobotHeard, RobotSource};
@@ -18,7 +18,7 @@ macro_rules! sample {
         Heard
     };
     ($topic:ident $payload:tt) => {
-        Received<schema::payload_type!($payload)>
+        Received<scanhub_schema::payload_type!($payload)>
     };
 }
 
@@ -28,7 +28,7 @@ macro_rules! source {
         ZonesSource
     };
     ($topic:ident $payload:tt) => {
-        Follower<schema::payload_type!($payload)>
+        Follower<scanhub_schema::payload_type!($payload)>
     };
 }
 
@@ -90,7 +90,7 @@ macro_rules! samples {
     };
 }
 
-schema::for_each_topic!(samples);
+scanhub_schema::for_each_topic!(samples);
 
 impl Source {
     /// As [`new`](Self::new) for the zones of `sensor`, with its early warnings: one makes the verdict worse until the zones of

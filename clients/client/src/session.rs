@@ -4,9 +4,9 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind, Topic};
-use shm::{Domain, holder, is_starting};
-use shm::{Node, Payload, Subscriber};
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_shm::{Domain, holder, is_starting};
+use scanhub_shm::{Node, Payload, Subscriber};
 
 use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
@@ -60,7 +60,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
     pub fn look(&mut self) -> Result<Change, Failure> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -81,10 +81,10 @@ impl Session {
             return Ok(change);
         }
         // After all had gone, the next hub's shared memory has other names.
-        let is_member = |joined: &Joined| shm::is_member(&joined.node, domain.root());
+        let is_member = |joined: &Joined| scanhub_shm::is_member(&joined.node, domain.root());
         match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
             Some(true) => {}
-            _ => match shm::client_node(domain) {
+            _ => match scanhub_shm::client_node(domain) {
                 Ok(node) => {
                     let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
                     self.joined = Some(Joined { domain, wakeups, node });

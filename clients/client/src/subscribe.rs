@@ -4,9 +4,9 @@
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, check_followed};
-use shm::Payload;
-use shm::{DEFAULT_DOMAIN, Domain, Environment};
+use scanhub_schema::{Failure, check_followed};
+use scanhub_shm::Payload;
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
 use crate::follower::{Follower, Received};
 use crate::session::Session;
@@ -31,7 +31,7 @@ use crate::wait::Wait;
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
 pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
     Subscription::in_domain(places(None)?, sensor)
 }
@@ -40,7 +40,7 @@ pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, F
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](schema::Kind) if the name is not possible.
+/// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible.
 pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
     let environment = Environment::of_process();
     match domain {
@@ -64,7 +64,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
         check_followed(sensor)?;
         Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
@@ -85,7 +85,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if descriptors or places are short, [`Kind::Failed`](schema::Kind) if the domain
+    /// [`Kind::Short`](scanhub_schema::Kind) if descriptors or places are short, [`Kind::Failed`](scanhub_schema::Kind) if the domain
     /// is another user's or the topic has another layout.
     #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
     pub fn next(&mut self) -> Result<Option<Received<P>>, Failure> {
@@ -123,7 +123,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(longest))
     }
@@ -135,7 +135,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) without [`Wait::Event`], [`Kind::Short`](schema::Kind) if descriptors are.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) without [`Wait::Event`], [`Kind::Short`](scanhub_schema::Kind) if descriptors are.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         self.session.descriptor()
     }

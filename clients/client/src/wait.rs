@@ -3,8 +3,8 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Failure, Ring, Topic};
-use shm::{Bell, Listener, Node, Unsupported};
+use scanhub_schema::{Failure, Ring, Topic};
+use scanhub_shm::{Bell, Listener, Node, Unsupported};
 
 use crate::clock;
 
@@ -48,7 +48,7 @@ impl Wakeups {
 
     /// Those of `topic` of the sensor `name` too; whether they are there already.
     ///
-    /// [`Kind::Short`](schema::Kind) if memory, descriptors or places for consumers are.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory, descriptors or places for consumers are.
     pub(crate) fn add(&mut self, node: &Node, name: &str, topic: Topic) -> Result<bool, Failure> {
         let ring = topic.row().ring;
         if let Some(known) = self.sensors.iter_mut().find(|sensor| sensor.name == name) {
@@ -76,7 +76,7 @@ impl Wakeups {
     /// Sleeps until one of them wakes, a signal comes or `left` is over; returns at once if one has since the caller looked
     /// for samples.
     ///
-    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
     pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         if self.wait == Wait::Event {
             return self.wait_for_event(node, left);
@@ -99,7 +99,7 @@ impl Wakeups {
                 spin(&bells, until_ns);
                 Ok(())
             }
-            _ => shm::sleep_at_bells(&bells, until_ns),
+            _ => scanhub_shm::sleep_at_bells(&bells, until_ns),
         };
         match slept {
             Ok(()) => {
@@ -149,26 +149,26 @@ impl Wakeups {
         }
         let listeners: Vec<&Listener> =
             self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).collect();
-        if !self.taken && shm::take_wakeups(&listeners)? {
+        if !self.taken && scanhub_shm::take_wakeups(&listeners)? {
             self.taken = true;
             return Ok(());
         }
         self.taken = false;
-        shm::sleep(&listeners, left)
+        scanhub_shm::sleep(&listeners, left)
     }
 
     /// What is readable while events are pending, of each sensor that is listened to.
     pub(crate) fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(shm::descriptor)
+        self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(scanhub_shm::descriptor)
     }
 
     /// Takes the events that are pending; whether there were any. What was sent before has to be looked for.
     ///
-    /// [`Kind::Short`](schema::Kind) if an event does not work.
+    /// [`Kind::Short`](scanhub_schema::Kind) if an event does not work.
     pub(crate) fn take(&mut self) -> Result<bool, Failure> {
         let mut any = false;
         for listener in self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()) {
-            any |= shm::take_wakeups(&[listener])?;
+            any |= scanhub_shm::take_wakeups(&[listener])?;
         }
         Ok(any)
     }
@@ -187,8 +187,8 @@ impl Wakeups {
 impl Sensor {
     /// Whether it listens to the event, if possible.
     fn listen(&mut self, node: &Node) -> Result<bool, Failure> {
-        let Some(service) = shm::open_wake(node, &self.name)? else { return Ok(false) };
-        self.listener = Some(shm::listener(&service)?);
+        let Some(service) = scanhub_shm::open_wake(node, &self.name)? else { return Ok(false) };
+        self.listener = Some(scanhub_shm::listener(&service)?);
         Ok(true)
     }
 

@@ -7,8 +7,8 @@ mod warned;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Early, Failure, Header, Zones, check_followed};
-use shm::Domain;
+use scanhub_schema::{Early, Failure, Header, Zones, check_followed};
+use scanhub_shm::Domain;
 
 use crate::clock;
 use crate::follower::Follower;
@@ -38,7 +38,7 @@ use warned::Warned;
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](schema::Kind) if a name is not possible.
+/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
 pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
     ZonesFollower::in_domain(places(None)?, sensor)
 }
@@ -76,7 +76,7 @@ impl ZonesFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if the sensor's name is not possible.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if the sensor's name is not possible.
     pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
         check_followed(sensor)?;
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
@@ -108,7 +108,7 @@ impl ZonesFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if the system cannot wait.
+    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }

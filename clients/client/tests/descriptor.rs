@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use fake::{FakeHub, Place, until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_client::{Subscription, Wait, ZonesFollower};
-use schema::{Kind, Scan, Status, Verdict};
-use shm::{PortFactory, UpdateConnections};
+use scanhub_schema::{Kind, Scan, Status, Verdict};
+use scanhub_shm::{PortFactory, UpdateConnections};
 
 /// Whether `descriptor` gets readable within `longest`.
 fn is_readable(descriptor: &OwnedFd, longest: Duration) -> bool {

@@ -8,10 +8,10 @@ use fake::{FakeHub, Place, until};
 use scanhub_client::{
     Event, Kind, Marks, PublishSession, Scan, Subscription, Topic, Tracks, Verdict, Wait, Wake, Zones,
 };
-use schema::ScanHead;
-use schema::limits::TopicLimits;
-use shm::Bell;
-use shm::publisher;
+use scanhub_schema::ScanHead;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_shm::Bell;
+use scanhub_shm::publisher;
 
 fn marks(count: u8) -> Marks {
     Marks { count, ..Marks::default() }
@@ -211,7 +211,7 @@ fn samples_of_any_length_ring_the_bell_of_those_who_sleep_at_it() {
         .unwrap()
         .timeout(Duration::from_secs(60));
     assert!(followed.try_next().unwrap().is_none());
-    let node = shm::client_node(&place.domain).unwrap();
+    let node = scanhub_shm::client_node(&place.domain).unwrap();
     let bell = Bell::open(&node, "tracker.near").unwrap().expect("the sensor has one");
     for (number, beams) in [1, 401, 2_160].into_iter().enumerate() {
         let scan = Scan::of(ScanHead::default(), &vec![7; beams]);

@@ -5,8 +5,8 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use lan::Key;
-use schema::datagram::{Datagram, HEAD, Head, MAC, MTU_SAFE};
+use scanhub_lan::Key;
+use scanhub_schema::datagram::{Datagram, HEAD, Head, MAC, MTU_SAFE};
 
 /// Scans in a run, and runs.
 const SCANS: u32 = 200;

@@ -3,8 +3,8 @@
 
 use std::fmt;
 
-use schema::datagram::{Announce, Datagram};
-use schema::{Topic, check_sensor};
+use scanhub_schema::datagram::{Announce, Datagram};
+use scanhub_schema::{Topic, check_sensor};
 
 use crate::incoming::PeerTable;
 
@@ -76,8 +76,8 @@ fn words(text: &str) -> Option<(u64, &str, &str)> {
 
 #[cfg(test)]
 mod tests {
-    use schema::Zones;
-    use schema::datagram::{HEAD, Head, Packed};
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{HEAD, Head, Packed};
 
     use super::*;
     use crate::Stamp;

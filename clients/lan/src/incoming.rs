@@ -9,8 +9,8 @@ mod remote;
 
 use std::collections::HashMap;
 
-use schema::Topic;
-use schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamStats};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamStats};
 
 use crate::{Key, Stamp};
 use duplicate_gateways::DuplicateGateways;
@@ -250,8 +250,8 @@ impl Incoming {
 mod tests {
     use super::*;
 
-    use schema::Zones;
-    use schema::datagram::{HEAD, Packed};
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{HEAD, Packed};
 
     /// A datagram with zones, of gateway 5.
     fn zones(epoch: u32, sequence: u32) -> Vec<u8> {

@@ -2,7 +2,7 @@
 //! it is kept, and whether what was sent is new.
 
 use hmac::{Hmac, KeyInit, Mac};
-use schema::datagram::{MAC, covered};
+use scanhub_schema::datagram::{MAC, covered};
 use sha2::Sha256;
 
 /// A key of [`Key::LEN`] bytes.
@@ -48,7 +48,7 @@ impl std::fmt::Debug for Key {
 
 #[cfg(test)]
 mod tests {
-    use schema::datagram::{Datagram, HEAD, Head};
+    use scanhub_schema::datagram::{Datagram, HEAD, Head};
 
     use super::*;
 

@@ -9,7 +9,7 @@ mod slots;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use crate::Stamp;
 use numbering::Numbering;
@@ -28,7 +28,7 @@ pub const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 
 impl Outgoing {
     /// Makes the end of gateway `hub` in its life `epoch`. Its datagrams have at most `longest` bytes, and never more than
-    /// [`MTU_ETHERNET`](schema::datagram::MTU_ETHERNET).
+    /// [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
     pub fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Outgoing {
         Outgoing { numbering: Numbering::new(hub, epoch, form, longest), sensors: Vec::new() }
     }

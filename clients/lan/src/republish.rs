@@ -7,8 +7,8 @@ mod sensor;
 mod store;
 mod stream;
 
-use schema::datagram::{Announce, Arrival, Head, LIVES};
-use schema::{Failure, Topic};
+use scanhub_schema::datagram::{Announce, Arrival, Head, LIVES};
+use scanhub_schema::{Failure, Topic};
 
 use crate::Stamp;
 use crate::incoming::{Announcement, RemoteSample};
@@ -122,7 +122,7 @@ impl<S: TopicStore> Republisher<S> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are; the sensors that are there go on.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are; the sensors that are there go on.
     pub fn announced(
         &mut self,
         announcement: &Announcement,
@@ -346,8 +346,8 @@ mod tests {
     use std::cell::Cell;
     use std::rc::Rc;
 
-    use schema::datagram::{Announced, HEAD, MTU_ETHERNET, PORT, Packed};
-    use schema::{Header, Wake, Zones};
+    use scanhub_schema::datagram::{Announced, HEAD, MTU_ETHERNET, PORT, Packed};
+    use scanhub_schema::{Header, Wake, Zones};
 
     use crate::incoming::{Arrived, Incoming};
 

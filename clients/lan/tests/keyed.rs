@@ -5,10 +5,12 @@
 mod keyed_vectors;
 
 use keyed_vectors::{keyed, text, unhex};
-use lan::incoming::{Arrived, Incoming};
-use lan::{Key, Stamp};
-use schema::datagram::{Announce, Announced, Datagram, DatagramError, HEAD, Head, PORT, Packed, group};
-use schema::{Family, Topic, Zones};
+use scanhub_lan::incoming::{Arrived, Incoming};
+use scanhub_lan::{Key, Stamp};
+use scanhub_schema::datagram::{
+    Announce, Announced, Datagram, DatagramError, HEAD, Head, PORT, Packed, group,
+};
+use scanhub_schema::{Family, Topic, Zones};
 
 const SECOND_NS: u64 = 1_000_000_000;
 /// When the announcement comes with which it begins.

@@ -11,13 +11,13 @@ mod sending;
 use std::collections::{BTreeMap, BTreeSet};
 
 use fastrand::Rng;
-use lan::Stamp;
-use lan::incoming::Arrived;
-use lan::republish::LeftOut;
 use network::{Faults, Nanos, Network};
 use receiving::{Published, Receiving, Seen};
-use schema::datagram::{Datagram, DatagramError, HEAD, MTU_LEAST, MTU_SAFE};
-use schema::{Header, Topic, Verdict, Zones};
+use scanhub_lan::Stamp;
+use scanhub_lan::incoming::Arrived;
+use scanhub_lan::republish::LeftOut;
+use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::{Header, Topic, Verdict, Zones};
 use sending::{HUB, Key, Mishaps, NAMES, PERIOD_NS, Sending, Sent};
 
 const MS: Nanos = 1_000_000;

@@ -1,7 +1,7 @@
 //! The circles around the robot: each once, the worst over all sensors, and what is inside. Refuses to judge: whether a
 //! circle is violated is the hub's word.
 
-use schema::Verdict;
+use scanhub_schema::Verdict;
 
 use crate::{Point, Sensor};
 
@@ -23,7 +23,7 @@ impl Circle {
     /// The points of `sensor` that are inside, if the circle is violated in its view.
     pub fn inside<'a>(&self, sensor: &'a Sensor) -> impl Iterator<Item = Point> + use<'a> {
         let radius_m = self.radius_m;
-        let own = |zone: &&schema::Zone| f64::from(zone.radius_mm) / 1000.0 == radius_m;
+        let own = |zone: &&scanhub_schema::Zone| f64::from(zone.radius_mm) / 1000.0 == radius_m;
         let zone = sensor.zones.zones().iter().find(own).filter(|_| !sensor.mount.is_in_map());
         let is_violated = zone.is_some_and(|zone| zone.violated != 0);
         let points = is_violated.then(|| sensor.points()).into_iter().flatten();
@@ -58,7 +58,7 @@ pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
 mod tests {
     use super::*;
     use crate::{Mount, Scene};
-    use schema::{Header, Pose, Scan, ScanHead, Status, Zone, Zones};
+    use scanhub_schema::{Header, Pose, Scan, ScanHead, Status, Zone, Zones};
 
     #[test]
     fn a_circle_is_as_bad_as_its_worst_sensor_and_shows_what_is_inside() {

@@ -12,7 +12,7 @@ mod scene;
 mod trail;
 mod trouble;
 
-use schema::Pose;
+use scanhub_schema::Pose;
 
 pub use circles::{Circle, circles};
 pub use meter::Meter;

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use schema::{Flags, Header};
+use scanhub_schema::{Flags, Header};
 
 /// Rate and ages of one sensor's scans.
 #[derive(Clone, Debug, Default)]
@@ -27,10 +27,10 @@ impl Meter {
         }
     }
 
-    /// Returns the scans per second, or `None` while they span less than [`schema::MIN_RATE_SPAN`].
+    /// Returns the scans per second, or `None` while they span less than [`scanhub_schema::MIN_RATE_SPAN`].
     pub fn hz(&self) -> Option<f64> {
         let (first, last) = (self.scans.front()?.0, self.scans.back()?.0);
-        schema::rate_hz(self.scans.len() as u64 - 1, Duration::from_nanos(last - first))
+        scanhub_schema::rate_hz(self.scans.len() as u64 - 1, Duration::from_nanos(last - first))
     }
 
     /// Mean and greatest age on arrival, from the telegram's last byte, in ms.

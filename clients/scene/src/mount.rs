@@ -1,6 +1,6 @@
 //! Where a sensor sits: nobody told yet, on the robot, or in the map of a site.
 
-use schema::Pose;
+use scanhub_schema::Pose;
 
 /// Where a sensor sits, as far as that was told.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use schema::{Track, TrackState, Tracks};
+use scanhub_schema::{Track, TrackState, Tracks};
 
 /// The people of one tracker.
 #[derive(Clone, Debug, Default)]

@@ -83,7 +83,7 @@ fn nearest<'a>(
 mod tests {
     use super::*;
     use crate::Scene;
-    use schema::{Header, Pose, Scan, ScanHead, Status};
+    use scanhub_schema::{Header, Pose, Scan, ScanHead, Status};
 
     #[test]
     fn the_nearest_point_is_read() {

@@ -1,6 +1,6 @@
 //! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
 
-use schema::{
+use scanhub_schema::{
     Background, Counter, Flags, Foreground, Header, Lines, Mark, Marks, Scan, State, Status, Tracks, Verdict,
     Zones, is_remote,
 };
@@ -317,7 +317,7 @@ const OLD_NS: u64 = 1_000_000_000;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{ForegroundHead, Pose, ScanHead, Track, TrackSensor};
+    use scanhub_schema::{ForegroundHead, Pose, ScanHead, Track, TrackSensor};
 
     #[test]
     fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {

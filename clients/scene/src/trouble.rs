@@ -1,6 +1,6 @@
 //! Why nothing comes from a sensor, in words, and what a person does about it.
 
-use schema::{State, Status};
+use scanhub_schema::{State, Status};
 
 /// What is wrong, and its remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,7 +1,7 @@
 //! The background in three dimensions: for each beam in each narrow span of the mount's angle, how far it reaches always. It
 //! is learned by the paper's method: what is met in enough sweeps in a row replaces what was. Refuses to know time.
 
-use schema::PointClass;
+use scanhub_schema::PointClass;
 
 use crate::mount::Mount;
 use crate::settings::Settings;

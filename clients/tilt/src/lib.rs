@@ -27,7 +27,7 @@ struct Page;
 pub use angles::{Angle, Withheld};
 pub use check::{Check, Floor, Wall};
 pub use mount::Mount;
-pub use schema::{OBSTACLES, Obstacle, PointClass};
+pub use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
 pub use settings::Settings;
 pub use sweep::{Point, Sweep};
 pub use tilting::{Counts, Tilting};

@@ -1,7 +1,7 @@
 //! Obstacles: points that are near each other, in three dimensions. Two points are of the same obstacle if their cubes touch,
 //! or cubes between them do. Refuses to know which points are worth it.
 
-use schema::{OBSTACLES, Obstacle};
+use scanhub_schema::{OBSTACLES, Obstacle};
 
 /// A point that can belong to an obstacle.
 #[derive(Clone, Copy, Debug, Default)]

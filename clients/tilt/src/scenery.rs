@@ -1,7 +1,7 @@
 //! What a sweep shows: its points beside the background, whether its angles can be right, and what stands there. Refuses to
 //! know scans and how they are put in order.
 
-use schema::{Obstacle, PointClass};
+use scanhub_schema::{Obstacle, PointClass};
 
 use crate::background::{Model, Reading, placed};
 use crate::mount::Mount;

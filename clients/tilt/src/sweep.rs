@@ -1,6 +1,6 @@
 //! What one way of the mount from turn to turn has shown.
 
-use schema::{Obstacle, PointClass};
+use scanhub_schema::{Obstacle, PointClass};
 
 /// Where a beam ended.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use schema::Scan;
+use scanhub_schema::Scan;
 
 use crate::angles::{Angle, Angles, At, Step, Withheld};
 use crate::delay::{Delay, MOST_S};

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use schema::{Scan, ScanHead};
-use tilt::{Angle, Mount, Settings, Tilting};
+use scanhub_schema::{Scan, ScanHead};
+use scanhub_tilt::{Angle, Mount, Settings, Tilting};
 
 const MS: u64 = 1_000_000;
 
@@ -75,7 +75,7 @@ fn each_point_is_where_all_angles_together_say() {
         }
         let mut tilting = Tilting::new(mount, Settings::default());
         let mut made = 0;
-        let mut check = |sweep: &tilt::Sweep<'_>| {
+        let mut check = |sweep: &scanhub_tilt::Sweep<'_>| {
             for point in sweep.points {
                 let wanted = expected[&(point.stamp_ns, point.beam)];
                 let off = (0..3).map(|i| (wanted[i] - f64::from(point.at[i])).abs()).fold(0.0, f64::max);

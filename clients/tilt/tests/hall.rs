@@ -13,9 +13,9 @@ mod judge;
 
 use hall::Hall;
 use judge::{Score, Seen, seconds};
-use sim::mount::{Fault, FaultKind};
-use sim::world::World;
-use tilt::{Settings, Withheld};
+use scanhub_sim::mount::{Fault, FaultKind};
+use scanhub_sim::world::World;
+use scanhub_tilt::{Settings, Withheld};
 
 #[test]
 fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
@@ -46,7 +46,7 @@ fn of(kind: FaultKind) -> ([u64; Withheld::COUNT], u64) {
     let mount = "[sensor.mount]\nheight_mm = 900\narm_mm = [60, 40]\nfrom_deg = 0\nto_deg = 30\n";
     let text = format!("[[sensor]]\npose = [0, 0, 90]\n{mount}[noise]\nbias_mm = 0\n{room}");
     let settings = Settings { sweeps: 3, ..Settings::default() };
-    let fault = sim::mount::Fault { kind, from_s: 7.0, until_s: 10.0 };
+    let fault = scanhub_sim::mount::Fault { kind, from_s: 7.0, until_s: 10.0 };
     let world = World::of_toml("room", &text).unwrap_or_else(|failure| panic!("{failure}"));
     let world = world.with_mount_faults(&[fault]);
     let mut healthy = 0;
@@ -137,7 +137,7 @@ fn stamps_that_get_late_are_corrected_and_the_background_stays() {
     let mut known = 0;
     let mut hall = Hall::new(&world, 0);
     let counts = hall.play(Settings::default(), 40, |_, sweep| {
-        let is_known = sweep.points.iter().any(|point| point.class == tilt::PointClass::Background);
+        let is_known = sweep.points.iter().any(|point| point.class == scanhub_tilt::PointClass::Background);
         known += u32::from(sweep.from_ns > seconds(30) && is_known);
         assert!(sweep.is_doubted || sweep.obstacles.is_empty(), "{:?}", sweep.obstacles);
     });
@@ -165,7 +165,7 @@ fn a_top_that_level_beams_graze_is_no_obstacle() {
 
 #[test]
 fn a_check_finds_the_wall_ahead_between_side_walls() {
-    let mut check = tilt::Check::default();
+    let mut check = scanhub_tilt::Check::default();
     let mut hall = Hall::new(&"tilt".parse().expect("built in"), 1);
     hall.play(Settings::default(), 14, |_, sweep| check.take(sweep));
     let (floor, wall) = (check.floor(&hall.mount).expect("a floor"), check.wall().expect("a wall"));

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use schema::{Foreground, Scan};
+use scanhub_schema::{Foreground, Scan};
 
 use crate::picture::Picture;
 use crate::site::Site;
@@ -258,8 +258,8 @@ const FEEDBACK: f64 = 3.0;
 mod tests {
     use std::collections::BTreeSet;
 
-    use preprocess::background::{Model, Settings};
-    use schema::ScanHead;
+    use scanhub_preprocess::background::{Model, Settings};
+    use scanhub_schema::ScanHead;
 
     use super::*;
 

@@ -1,6 +1,6 @@
 //! One person as the tracker follows him: filter, and what speaks for him and against him. Refuses to know other persons.
 
-use schema::TrackState;
+use scanhub_schema::TrackState;
 
 use crate::filter::{Filter, Side};
 use crate::geometry::Point;

@@ -1,7 +1,7 @@
 //! What the tracker says: tracks at an instant, and what happened to them; and as it is published. Refuses to know how they
 //! are found.
 
-use schema::{EventKind, Pose, TrackSensor, TrackState, Tracks};
+use scanhub_schema::{EventKind, Pose, TrackSensor, TrackState, Tracks};
 
 use crate::geometry::Point;
 use crate::site::{Sensor, Site};
@@ -105,8 +105,8 @@ impl Sensor {
 }
 
 impl Track {
-    fn payload(&self, site: &Site) -> schema::Track {
-        let mut track = schema::Track {
+    fn payload(&self, site: &Site) -> scanhub_schema::Track {
+        let mut track = scanhub_schema::Track {
             id: self.id,
             x_m: self.place[0] as f32,
             y_m: self.place[1] as f32,
@@ -117,7 +117,7 @@ impl Track {
             age_ms: (1000.0 * self.age_s) as u32,
             sensors: self.sensors,
             state: self.state as u8,
-            ..schema::Track::default()
+            ..scanhub_schema::Track::default()
         };
         track.set_room(self.room.and_then(|room| site.rooms.get(room)).map_or("", |room| &room.name));
         track
@@ -126,9 +126,9 @@ impl Track {
 
 impl Event {
     /// Returns the event as it is published, with the names that `site` gives.
-    pub fn payload(&self, site: &Site) -> schema::Event {
+    pub fn payload(&self, site: &Site) -> scanhub_schema::Event {
         let room = self.room.and_then(|room| site.rooms.get(room)).map(|room| room.name.as_str());
-        let of = |kind| schema::Event::new(kind, self.id, room);
+        let of = |kind| scanhub_schema::Event::new(kind, self.id, room);
         match self.kind {
             Kind::Appeared => of(EventKind::Appeared),
             Kind::Left => of(EventKind::Left),
@@ -140,5 +140,7 @@ impl Event {
     }
 }
 
-const _: () =
-    assert!(crate::tracker::PERSONS == schema::TRACKS && crate::site::SENSORS == schema::TRACK_SENSORS);
+const _: () = assert!(
+    crate::tracker::PERSONS == scanhub_schema::TRACKS
+        && crate::site::SENSORS == scanhub_schema::TRACK_SENSORS
+);

@@ -3,7 +3,7 @@
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
-use schema::{Foreground, Scan};
+use scanhub_schema::{Foreground, Scan};
 
 use crate::geometry::{Point, distance, minus};
 use crate::site::{Sensor, Site};

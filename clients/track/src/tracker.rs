@@ -2,7 +2,7 @@
 
 mod doors;
 
-use schema::{Foreground, Scan};
+use scanhub_schema::{Foreground, Scan};
 
 use crate::assignment::{Assignment, Edge};
 use crate::filter::Side;

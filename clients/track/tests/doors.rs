@@ -4,8 +4,8 @@
 mod hall;
 
 use hall::{LEAVES, Leaves, SCANNERS, SITE, Scene, Walker, events};
-use track::geometry::Point;
-use track::{Event, Kind};
+use scanhub_track::geometry::Point;
+use scanhub_track::{Event, Kind};
 
 /// Positions of the scanner: in the middle of the wall, at its side, and nearer to the door.
 const PLACES: [Point; 3] = [[0.0, 0.0], [0.0, -2.5], [2.5, -2.5]];

@@ -3,7 +3,7 @@
 mod hall;
 
 use hall::{Leaves, SCANNERS, SITE, Scene, Walker, run};
-use track::Kind;
+use scanhub_track::Kind;
 
 const FOUNTAIN: &str = r#"
 [[ignore]]

@@ -10,12 +10,12 @@ use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 
 use flate2::read::GzDecoder;
-use preprocess::background::{Model, Settings};
-use preprocess::segments::Segmenter;
-use schema::{Background, BackgroundHead, Code, Foreground, Pose, Scan, ScanHead, TrackState};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Background, BackgroundHead, Code, Foreground, Pose, Scan, ScanHead, TrackState};
+use scanhub_track::geometry::{Point, distance};
+use scanhub_track::{People, Picture, Site};
 use serde_json::Value;
-use track::geometry::{Point, distance};
-use track::{People, Picture, Site};
 
 const BEAMS: usize = 768;
 /// Ten seconds, after which something is background, of the 7.5 scans a second that there are.

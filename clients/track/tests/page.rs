@@ -1,6 +1,6 @@
 //! docs/tracks.md: its site file is right, and its drawing is made of it.
 
-use track::Site;
+use scanhub_track::Site;
 
 fn page(name: &str) -> String {
     let path = format!("{}/../../docs/{name}", env!("CARGO_MANIFEST_DIR"));

@@ -11,12 +11,12 @@ mod walkers;
 use std::collections::BTreeSet;
 
 use house::{BEAMS, Eye, House};
-use preprocess::background::{Model, Settings};
-use preprocess::segments::Segmenter;
-use schema::TrackState;
-use schema::{Foreground, Pose, Scan};
-use track::geometry::distance;
-use track::{People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::TrackState;
+use scanhub_schema::{Foreground, Pose, Scan};
+use scanhub_track::geometry::distance;
+use scanhub_track::{People, Picture, Site};
 use walkers::Crowd;
 
 const DELAY_NS: u64 = 80_000_000;
@@ -140,7 +140,7 @@ fn an_identity_is_never_used_again_and_nobody_is_invented_when_a_sensor_dies() {
         gone.extend(before.difference(&now).copied());
         assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
         let is_here =
-            |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
+            |track: &&scanhub_track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
         let known = picture.tracks.iter().filter(is_here).count();
         assert!(known <= 4, "three people, and one who is not yet joined: {picture:?}");
         before = now;
@@ -161,7 +161,7 @@ fn a_clock_that_is_off_is_found_by_those_whom_both_see() {
 #[test]
 fn a_sensor_that_sits_beside_its_place_is_told_by_those_whom_two_see() {
     let sent = sent(3, 60);
-    let told = |pictures: &[Picture]| -> Vec<track::Misplaced> {
+    let told = |pictures: &[Picture]| -> Vec<scanhub_track::Misplaced> {
         pictures.iter().flat_map(|picture| picture.misplaced.iter().copied()).collect()
     };
     let (right, _) = pictures(sent.iter());
@@ -176,7 +176,8 @@ fn a_sensor_that_sits_beside_its_place_is_told_by_those_whom_two_see() {
     assert!((told[0].off[0] + 0.4).abs() < 0.1 && (told[0].off[1] - 0.3).abs() < 0.1, "{told:?}");
     // From then on nobody is seen twice.
     let since = shown.iter().position(|picture| !picture.misplaced.is_empty()).expect("it is told");
-    let is_known = |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
+    let is_known =
+        |track: &&scanhub_track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
     let most =
         shown[since + 100..].iter().map(|picture| picture.tracks.iter().filter(is_known).count()).max();
     assert!(most <= Some(4), "three people, and one who is not yet joined: {most:?}");
@@ -187,7 +188,8 @@ fn a_sensor_that_comes_back_sees_those_who_are_there_and_nobody_else() {
     let sent = sent(3, 60);
     let is_away = |one: &&Sent| one.sensor < 2 && (20_000..30_000).contains(&((one.wall_ns - BEGIN_NS) / MS));
     let (pictures, _) = pictures(sent.iter().filter(|one| !is_away(one)));
-    let is_known = |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
+    let is_known =
+        |track: &&scanhub_track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
     let most = pictures.iter().map(|picture| picture.tracks.iter().filter(is_known).count()).max();
     assert!(most <= Some(4), "three people, and one who is not yet joined: {most:?}");
     // While nobody looks, who is there gets uncertain.
@@ -214,7 +216,7 @@ fn no_track_stays_on_the_chair_of_a_person_who_has_left() {
                 continue;
             };
             sat += usize::from(people.iter().any(|&place| is_at_chair(place)));
-            let is_nobody = |track: &&track::Track| {
+            let is_nobody = |track: &&scanhub_track::Track| {
                 matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
                     && people.iter().all(|&place| distance(place, track.place) > 0.7)
                     && track.room.is_some_and(|room| site.watched()[room])

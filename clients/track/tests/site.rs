@@ -1,7 +1,7 @@
 //! Site files: what is read, and what each mistake is told.
 
-use schema::Kind;
-use track::Site;
+use scanhub_schema::Kind;
+use scanhub_track::Site;
 
 const HOUSE: &str = r#"
 [[sensor]]

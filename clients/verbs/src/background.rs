@@ -9,11 +9,11 @@ use std::time::{Duration, SystemTime};
 use scanhub_client::request;
 use scanhub_files::output::{self, Target};
 use scanhub_files::regular;
-use schema::{
+use scanhub_schema::{
     Age, Background, BackgroundHead, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
 };
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::control::done;
 use crate::names::as_word;

@@ -5,7 +5,7 @@
 //! The observation is divided into slices of time. What is seen in all slices at about the same range is body; what is
 //! seen in only some of them came and went, and is left out.
 
-use schema::{Pose, Scan, in_degrees, in_sector_mdeg};
+use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
 /// Slices of the time.
 pub(crate) const SLICES: usize = 10;

@@ -5,8 +5,8 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_client::request;
-use schema::{Failure, Request, Verb, check_sensor};
-use shm::Domain;
+use scanhub_schema::{Failure, Request, Verb, check_sensor};
+use scanhub_shm::Domain;
 
 use crate::json;
 use crate::names::as_word;

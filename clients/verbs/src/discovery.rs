@@ -3,8 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Maker, Topic};
-use shm::Domain;
+use scanhub_schema::{Failure, Maker, Topic};
+use scanhub_shm::Domain;
 
 use crate::background_task::BackgroundTask;
 
@@ -79,7 +79,7 @@ impl Discovery {
 
     /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time.
     ///
-    /// [`Kind::Failed`](schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
+    /// [`Kind::Failed`](scanhub_schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
     pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((task, age)) = &self.call {
             let Some(answer) = task.result() else { return Ok(None) };
@@ -95,7 +95,8 @@ impl Discovery {
         let age = now - *came;
         if age >= due(*calls) {
             let domain = domain.clone();
-            self.call = BackgroundTask::begin(move || shm::published(&domain)).map(|task| (task, age));
+            self.call =
+                BackgroundTask::begin(move || scanhub_shm::published(&domain)).map(|task| (task, age));
             *calls += usize::from(self.call.is_some());
         }
         Ok(None)
@@ -140,7 +141,7 @@ mod tests {
                 }
             }
         };
-        let short = || Err(Failure::new(schema::Kind::Short, "no descriptor is left", "ulimit -n"));
+        let short = || Err(Failure::new(scanhub_schema::Kind::Short, "no descriptor is left", "ulimit -n"));
         assert!(answer(short()).is_err());
         assert_eq!(answer(Ok(vec![("front".to_owned(), Topic::Scan)])), Ok(Some(vec!["front".to_owned()])));
         assert_eq!(answer(short()), Ok(None));

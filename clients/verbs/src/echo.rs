@@ -4,9 +4,9 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::Sample;
-use schema::csv::ScanColumns;
-use schema::{Failure, Header, Kind, Scan, Topic};
-use shm::Domain;
+use scanhub_schema::csv::ScanColumns;
+use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
+use scanhub_shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{GRACE, Sample, Session, Who};
 use scanhub_client::{Wait, clock};
-use schema::{Failure, Kind, Status, Topic, is_remote};
-use shm::Domain;
+use scanhub_schema::{Failure, Kind, Status, Topic, is_remote};
+use scanhub_shm::Domain;
 
 use crate::discovery::Discovery;
 use crate::names::TopicName;

@@ -11,11 +11,11 @@ use std::num::NonZeroU64;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use lan::outgoing::Sample;
 use scanhub_client::clock;
 use scanhub_client::streams::{GRACE, Session};
-use schema::{Failure, Topic, check_sensor};
-use shm::Domain;
+use scanhub_lan::outgoing::Sample;
+use scanhub_schema::{Failure, Topic, check_sensor};
+use scanhub_shm::Domain;
 
 use crate::discovery::Discovery;
 use crate::follow::Notice;
@@ -84,7 +84,7 @@ impl Forwarder {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if descriptors or memory are.
+    /// [`Kind::Short`](scanhub_schema::Kind) if descriptors or memory are.
     pub fn forward(&mut self, carrier: &mut impl Carrier) -> Result<bool, Failure> {
         let (mut more, mut subscribed) = (false, false);
         for sensor in &mut self.sensors {
@@ -98,7 +98,7 @@ impl Forwarder {
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`](schema::Kind) if the first hub that is met has not all sensors that are named, and what `tell` says.
+    /// [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub that is met has not all sensors that are named, and what `tell` says.
     pub fn look(
         &mut self,
         now: Instant,
@@ -130,7 +130,7 @@ impl Forwarder {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`](schema::Kind) if the system does not let it wait.
+    /// [`Kind::Failed`](scanhub_schema::Kind) if the system does not let it wait.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
         let left = self.sensors.iter().filter_map(Sensor::left).chain(self.discovery.left());
         self.session.wait_for(Some(left.fold(at_most, Duration::min)))?;

@@ -13,10 +13,10 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use lan::Key;
-use lan::outgoing::{ANNOUNCE_EVERY, Form};
-use schema::{Failure, Kind};
-use shm::Domain;
+use scanhub_lan::Key;
+use scanhub_lan::outgoing::{ANNOUNCE_EVERY, Form};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::Domain;
 
 use crate::forward::{Forwarder, Selection, begin_life};
 use crate::key_file;

@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
-use schema::{Failure, Status, Topic};
+use scanhub_schema::{Failure, Status, Topic};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
@@ -178,7 +178,7 @@ impl LineWindow {
     }
 }
 
-/// Class `hz`. Rate, jitter and extremes are null while the arrivals span less than [`schema::MIN_RATE_SPAN`].
+/// Class `hz`. Rate, jitter and extremes are null while the arrivals span less than [`scanhub_schema::MIN_RATE_SPAN`].
 #[derive(Serialize)]
 struct Line<'a> {
     class: &'static str,

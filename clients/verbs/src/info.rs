@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::{Follower, GRACE, Session, find};
-use schema::{Counter, Failure, Family, Kind, Pose, Status, check_followed};
-use shm::{Domain, is_starting};
+use scanhub_schema::{Counter, Failure, Family, Kind, Pose, Status, check_followed};
+use scanhub_shm::{Domain, is_starting};
 
 use crate::json;
 use crate::names::{as_word, no_sensor};
@@ -53,7 +53,7 @@ pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
 fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
     let give_up_at = Instant::now() + GRACE;
     loop {
-        let sensors = shm::links(domain)?;
+        let sensors = scanhub_shm::links(domain)?;
         match sensor {
             None => return Ok(sensors),
             Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),

@@ -6,7 +6,7 @@ use std::net::{IpAddr, Ipv4Addr};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::{InterfaceFlags, if_nametoindex};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 pub(crate) use changes::Changes;
 

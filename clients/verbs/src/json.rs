@@ -4,7 +4,7 @@ mod people;
 mod processed;
 mod tilted;
 
-use schema::{
+use scanhub_schema::{
     Code, Counters, Failure, Family, Flags, Header, Intensities, Reasons, Scan, Status, Telegram, Verb,
     in_degrees,
 };
@@ -20,7 +20,7 @@ pub(crate) use people::{event, tracks};
 pub(crate) use processed::{early, foreground, lines, marks, motion, robot, zones};
 pub(crate) use tilted::{cloud, obstacles, tilt};
 // A background model as a line is what a file of it is.
-pub(crate) use schema::as_json as background;
+pub(crate) use scanhub_schema::as_json as background;
 
 /// What all samples of telegrams begin with.
 #[derive(Serialize)]
@@ -329,7 +329,7 @@ pub fn error(failure: &Failure) -> String {
     }
     let line =
         Line { class: "error", kind: failure.kind.name(), message: &failure.message, hint: &failure.hint };
-    schema::json_line(serde_json::to_string(&line).unwrap_or_default())
+    scanhub_schema::json_line(serde_json::to_string(&line).unwrap_or_default())
 }
 
 fn known<T: PartialEq>(value: T, unknown: T) -> Option<T> {

@@ -5,11 +5,11 @@ use std::io::Write;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use lan::Key;
 use rustix::rand::{GetRandomFlags, getrandom};
 use scanhub_files::output::{PRIVATE, Target, unwritable};
 use scanhub_files::regular;
-use schema::{Failure, Kind};
+use scanhub_lan::Key;
+use scanhub_schema::{Failure, Kind};
 use serde_json::json;
 
 use crate::output::{Output, quiet};

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
-use schema::{Failure, Flags, Kind};
-use shm::Domain;
+use scanhub_schema::{Failure, Flags, Kind};
+use scanhub_shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow_closely};
 use crate::names::TopicName;

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::{Freshness, Sample};
-use schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
+use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow, follow_with_early};
 use crate::names::{TopicName, as_word};

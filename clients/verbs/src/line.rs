@@ -1,7 +1,7 @@
 //! What the line of one sensor lost while a verb ran, from the counters of its statuses. The counters start at 0 when
 //! the hub restarts. Refuses to know where statuses come from.
 
-use schema::{Counter, Counters};
+use scanhub_schema::{Counter, Counters};
 
 /// The account of one line in one run.
 #[derive(Clone, Debug, Default)]

@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
-use schema::{Failure, Family, Pace, State, Status, Topic};
+use scanhub_schema::{Failure, Family, Pace, State, Status, Topic};
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
+use scanhub_shm::{Node, Payload, PortFactory};
 use serde::{Serialize, Serializer};
-use shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
-use shm::{Node, Payload, PortFactory};
 
 use crate::info::statuses;
 use crate::output::{Output, quiet, table};
@@ -25,16 +25,16 @@ pub struct ListOptions {
 /// Writes the topics of every sensor of the hub to `out`, with rate, subscribers, payload type and revision. As text, the
 /// problem of each sensor that has one follows.
 ///
-/// [`Kind::NoHub`](schema::Kind) within a second if there is none, [`Kind::Interrupted`](schema::Kind) if `stop` is set.
+/// [`Kind::NoHub`](scanhub_schema::Kind) within a second if there is none, [`Kind::Interrupted`](scanhub_schema::Kind) if `stop` is set.
 pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
-    let node = shm::client_node(&domain)?;
-    let sensors = shm::sensors(&domain)?;
+    let node = scanhub_shm::client_node(&domain)?;
+    let sensors = scanhub_shm::sensors(&domain)?;
     let (mut lines, mut problems) = (Vec::new(), Vec::new());
     for sensor in &sensors {
         of_sensor(&node, sensor, &mut lines)?;
     }
-    for (sensor, status) in statuses(&domain, &shm::links(&domain)?, stop)? {
+    for (sensor, status) in statuses(&domain, &scanhub_shm::links(&domain)?, stop)? {
         for line in
             lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
         {
@@ -65,7 +65,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     )
 }
 
-/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](shm::Environment::bases)) to `out`,
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](scanhub_shm::Environment::bases)) to `out`,
 /// including those of `hubs` below another directory. Hubs that this user cannot reach follow, with a command that does.
 ///
 /// # Errors
@@ -186,13 +186,13 @@ macro_rules! lines {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Adds a line for each topic of `sensor`.
         fn of_sensor(node: &Node, sensor: &str, lines: &mut Vec<Line>) -> Result<(), Failure> {
-            $(lines.extend(line::<schema::payload_type!($payload)>(node, sensor)?);)*
+            $(lines.extend(line::<scanhub_schema::payload_type!($payload)>(node, sensor)?);)*
             Ok(())
         }
     };
 }
 
-schema::for_each_topic!(lines);
+scanhub_schema::for_each_topic!(lines);
 
 fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, Failure> {
     let topic = P::TOPIC;
@@ -201,7 +201,7 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
         sensor: sensor.to_owned(),
         topic,
         payload: topic.payload(),
-        revision: shm::payload_revision(service.attributes()),
+        revision: scanhub_shm::payload_revision(service.attributes()),
         hz: None,
         subscribers: service.dynamic_config().number_of_subscribers(),
     }))

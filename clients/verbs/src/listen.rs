@@ -10,11 +10,11 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use lan::Stamp;
-use schema::datagram::group;
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, Topic};
-use shm::{Domain, StateDirectory};
+use scanhub_lan::Stamp;
+use scanhub_schema::datagram::group;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_shm::{Domain, StateDirectory};
 
 use self::multicast_receiver::{LONGEST, MulticastReceiver};
 use self::wanted::{groups, topics};

@@ -7,9 +7,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use scanhub_client::streams::Sample;
-use schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
+use scanhub_schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Notice, Sink, follow};

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use schema::{Failure, Kind, ROBOT, Topic, check_followed};
+use scanhub_schema::{Failure, Kind, ROBOT, Topic, check_followed};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -106,7 +106,7 @@ pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Maker;
+    use scanhub_schema::Maker;
 
     #[test]
     fn names() {

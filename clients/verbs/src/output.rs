@@ -3,7 +3,7 @@
 
 use std::io::{self, ErrorKind, Write};
 
-use schema::{Failure, Kind, escape_json};
+use scanhub_schema::{Failure, Kind, escape_json};
 use serde::Serialize;
 
 /// Why a verb ended early.

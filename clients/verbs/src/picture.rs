@@ -3,9 +3,9 @@
 
 use scanhub_client::streams::Sample;
 use scanhub_client::{clock, live_topics};
-use scene::Scene;
-use schema::{Maker, Topic};
-use shm::Domain;
+use scanhub_scene::Scene;
+use scanhub_schema::{Maker, Topic};
+use scanhub_shm::Domain;
 
 use crate::follow::Notice;
 use crate::names::TopicName;

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Pace, Topic};
+use scanhub_schema::{Pace, Topic};
 
 use crate::line::Loss;
 
@@ -63,10 +63,10 @@ impl ReceiveStats {
     }
 
     /// Returns the samples per second from the first sample that was received as it was sent to the last one. `None` if these
-    /// are less than [`schema::MIN_RATE_SPAN`] apart.
+    /// are less than [`scanhub_schema::MIN_RATE_SPAN`] apart.
     pub(crate) fn hz(&self) -> Option<f64> {
         let ((live, first), last) = (self.live?, self.last?);
-        schema::rate_hz(live - 1, last - first)
+        scanhub_schema::rate_hz(live - 1, last - first)
     }
 
     /// The silence since the last sample became too long just now; said once per silence.

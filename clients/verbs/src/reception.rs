@@ -14,12 +14,12 @@ use std::collections::HashMap;
 use std::net::IpAddr;
 use std::time::Instant;
 
-use lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
-use lan::{Key, Stamp};
-use schema::datagram::{DatagramError, Head};
-use schema::limits::TopicLimits;
-use schema::{Failure, Topic};
-use shm::{Domain, StateDirectory};
+use scanhub_lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
+use scanhub_lan::{Key, Stamp};
+use scanhub_schema::datagram::{DatagramError, Head};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Topic};
+use scanhub_shm::{Domain, StateDirectory};
 
 use crate::interface::is_of_this_machine;
 use crate::output::{End, Output};
@@ -114,8 +114,8 @@ impl<'a> Reception<'a> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if a name or hub is not possible, or too little memory is allowed for a sensor;
-    /// [`Kind::DomainHeld`](schema::Kind) if another listener publishes in the domain, [`Kind::Short`](schema::Kind) if there is
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not possible, or too little memory is allowed for a sensor;
+    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, [`Kind::Short`](scanhub_schema::Kind) if there is
     /// too little memory.
     pub fn open(
         wanted: Wanted<'_>,

@@ -25,9 +25,9 @@ use std::time::{Duration, Instant};
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
 use scanhub_files::output::Target;
-use schema::file::Compression;
-use schema::{Failure, Header, Kind};
-use shm::Domain;
+use scanhub_schema::file::Compression;
+use scanhub_schema::{Failure, Header, Kind};
+use scanhub_shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::lossy_writer::LossyWriter;

@@ -1,7 +1,7 @@
 //! The syntax for verbs that take several topics: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`. Refuses to know which
 //! sensors there are.
 
-use schema::{Failure, Kind, Maker, ROBOT, Topic};
+use scanhub_schema::{Failure, Kind, Maker, ROBOT, Topic};
 
 use crate::names::{TopicName, as_word, nearest, topics};
 
@@ -36,7 +36,7 @@ impl Word {
                 Err(Failure::new(Kind::Usage, format!("{text} is not possible"), hint))
             }
             (sensor, ALL) => {
-                as_word(schema::check_followed(sensor))?;
+                as_word(scanhub_schema::check_followed(sensor))?;
                 Ok(Word { sensor: Some(sensor.to_owned()), topic: None })
             }
             _ => {

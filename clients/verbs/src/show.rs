@@ -5,12 +5,12 @@ use std::io;
 
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
-use schema::{
+use scanhub_schema::{
     Background, Cloud, Early, Event, Foreground, Header, Lines, Marks, Motion, Obstacles, Scan, Status, Tilt,
     Tracks, Zones,
 };
+use scanhub_shm::Payload;
 use serde::Serialize;
-use shm::Payload;
 
 use crate::output::{End, Output};
 use crate::{json, text};
@@ -140,4 +140,4 @@ macro_rules! samples {
     };
 }
 
-schema::for_each_topic!(samples);
+scanhub_schema::for_each_topic!(samples);

@@ -1,7 +1,7 @@
 //! The clocks of this machine, read for an end of a network. Refuses to know what is stamped.
 
-use lan::Stamp;
 use scanhub_client::clock;
+use scanhub_lan::Stamp;
 
 /// Returns this moment.
 pub fn now() -> Stamp {

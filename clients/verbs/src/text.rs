@@ -9,7 +9,7 @@ use std::fmt;
 use std::io::{self, Write};
 
 use scanhub_client::streams::Sample;
-use schema::{Failure, Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
+use scanhub_schema::{Failure, Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
 
 use crate::follow::Notice;
 use crate::names::TopicName;

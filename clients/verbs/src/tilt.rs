@@ -9,11 +9,11 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use ::tilt::{Angle, Check, Mount, Settings, Sweep, Tilting, Withheld};
 use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Failure, Kind, Topic};
-use shm::Domain;
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_shm::Domain;
+use scanhub_tilt::{Angle, Check, Mount, Settings, Sweep, Tilting, Withheld};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
@@ -50,10 +50,10 @@ pub struct TiltOptions {
 ///
 /// # Errors
 ///
-/// [`Kind::NoTopic`](schema::Kind) with the sensors that there are, [`Kind::NoHub`](schema::Kind) if bounded and there is none
-/// at the start, [`Kind::Timeout`](schema::Kind), [`Kind::Interrupted`](schema::Kind) if bounded and `stop` came first; those of
-/// publishing if it has a name. [`Kind::Check`](schema::Kind) if a check has failed, and
-/// [`Kind::Interrupted`](schema::Kind) or [`Kind::Timeout`](schema::Kind) if it ended too early.
+/// [`Kind::NoTopic`](scanhub_schema::Kind) with the sensors that there are, [`Kind::NoHub`](scanhub_schema::Kind) if bounded and there is none
+/// at the start, [`Kind::Timeout`](scanhub_schema::Kind), [`Kind::Interrupted`](scanhub_schema::Kind) if bounded and `stop` came first; those of
+/// publishing if it has a name. [`Kind::Check`](scanhub_schema::Kind) if a check has failed, and
+/// [`Kind::Interrupted`](scanhub_schema::Kind) or [`Kind::Timeout`](scanhub_schema::Kind) if it ended too early.
 pub fn tilt(
     options: &TiltOptions,
     out: &mut dyn Write,

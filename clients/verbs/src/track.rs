@@ -8,12 +8,12 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use ::track::{Kind as EventKind, Misplaced, People, Picture, Site};
 use late::LateReports;
 use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Failure, Foreground, Header, Kind, Scan, Topic};
-use shm::Domain;
+use scanhub_schema::{Failure, Foreground, Header, Kind, Scan, Topic};
+use scanhub_shm::Domain;
+use scanhub_track::{Kind as EventKind, Misplaced, People, Picture, Site};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
-use schema::{Failure, Kind, Topic, Verb, check_followed, is_remote};
-use shm::Domain;
+use scanhub_schema::{Failure, Kind, Topic, Verb, check_followed, is_remote};
+use scanhub_shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
@@ -30,7 +30,7 @@ use crate::receive_stats::ReceiveStats;
 use crate::work::Work;
 use hub_requests::HubRequests;
 use keys::Key;
-use scene::Scene;
+use scanhub_scene::Scene;
 use screen::{News, Screen};
 use view::{View, Wish};
 

@@ -14,9 +14,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread;
 
-use ::web::{Board, Door, Playback, Server};
-use schema::{Failure, Kind, Maker, check_followed};
-use shm::Domain;
+use scanhub_schema::{Failure, Kind, Maker, check_followed};
+use scanhub_shm::Domain;
+use scanhub_web::{Board, Door, Playback, Server};
 
 use crate::follow::{Bounds, follow};
 use crate::interface::reachable_addresses;
@@ -147,7 +147,7 @@ impl Drop for Close<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ::web::{Order, Progress};
+    use scanhub_web::{Order, Progress};
     use std::io;
     use std::net::TcpStream;
     use std::time::Duration;

@@ -58,7 +58,7 @@ impl Window {
         }
     }
 
-    /// Returns the rate, or `None` if the arrivals span less than [`schema::MIN_RATE_SPAN`].
+    /// Returns the rate, or `None` if the arrivals span less than [`scanhub_schema::MIN_RATE_SPAN`].
     pub(crate) fn rate(&self) -> Option<Rate> {
         let span = self.span();
         let times_ms = || {
@@ -68,7 +68,7 @@ impl Window {
                 .map(|(a, b)| (b.0 - a.0).as_secs_f64() * 1e3)
         };
         let count = times_ms().count();
-        let hz = schema::rate_hz(count as u64, span)?;
+        let hz = scanhub_schema::rate_hz(count as u64, span)?;
         let mean = span.as_secs_f64() * 1e3 / count as f64;
         let variance = times_ms().map(|time| (time - mean).powi(2)).sum::<f64>() / count as f64;
         Some(Rate {

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rustix::event::{EventfdFlags, eventfd};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// Description of a channel.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -5,9 +5,9 @@ mod replay;
 mod scene_update;
 mod tilt;
 
-use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
-use scene::{Scene, Sensor, Trouble, rooms};
-use schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
+use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
+use scanhub_scene::{Scene, Sensor, Trouble, rooms};
+use scanhub_schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
 use serde::Serialize;
 
 use crate::board::Channel;
@@ -93,7 +93,7 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> 
         people: Option<String>,
         trouble: Option<Words<'a>>,
     }
-    let (verdict, sensor, nearest_mm) = scene::verdict(scene.robot().map(|(_, sensor)| sensor));
+    let (verdict, sensor, nearest_mm) = scanhub_scene::verdict(scene.robot().map(|(_, sensor)| sensor));
     bytes(&Robot {
         verdict: verdict.name(),
         sensor,
@@ -212,7 +212,7 @@ pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Bac
         ..ScanHead::default()
     };
     let header = Header { wall_ns, ..Header::default() };
-    ros::laser_scan(message, ros::frame(sensor), &header, &Scan::of(head, &ranges));
+    scanhub_ros::laser_scan(message, scanhub_ros::frame(sensor), &header, &Scan::of(head, &ranges));
 }
 
 /// Stands for a range that no sensor measures.
@@ -223,7 +223,7 @@ pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.mount.pose()?));
     let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
     let mut message = Vec::new();
-    ros::static_transforms(&mut message, wall_ns, &poses);
+    scanhub_ros::static_transforms(&mut message, wall_ns, &poses);
     message
 }
 
@@ -268,8 +268,8 @@ fn bytes(value: &impl Serialize) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros::read;
-    use schema::BackgroundHead;
+    use scanhub_ros::read;
+    use scanhub_schema::BackgroundHead;
 
     #[test]
     fn a_background_is_a_scan_of_what_is_known() {
@@ -316,10 +316,10 @@ mod tests {
             (zones_channel(), zones(&scene, 1)),
             (marks_channel(), marks(&scene, 1)),
             (lines_channel(), lines(&scene, 1)),
-            (tracks_channel("house"), tracks(&scene::People::default(), 1)),
+            (tracks_channel("house"), tracks(&scanhub_scene::People::default(), 1)),
             (replay_channel(), replay(&crate::Progress::default())),
-            (tilt_channel("mount"), tilt(&schema::Tilt::default())),
-            (obstacles_channel("hall"), obstacles(&Header::default(), &schema::Obstacles::default())),
+            (tilt_channel("mount"), tilt(&scanhub_schema::Tilt::default())),
+            (obstacles_channel("hall"), obstacles(&Header::default(), &scanhub_schema::Obstacles::default())),
         ];
         for (channel, message) in pairs {
             let schema: serde_json::Value = serde_json::from_str(channel.schema).unwrap();

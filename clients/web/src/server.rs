@@ -11,7 +11,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::sockopt::set_socket_send_buffer_size;
 use rustix::rand::{GetRandomFlags, getrandom};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::board::Board;
 use crate::door::{Door, Refusal};

@@ -7,10 +7,10 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
+use scanhub_web::{Board, Channel, ChannelId, Door, Event, Server, VIEWERS};
 use serde_json::json;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
-use web::{Board, Channel, ChannelId, Door, Event, Server, VIEWERS};
 
 /// Far longer than a message takes.
 const PATIENCE: Duration = Duration::from_secs(60);

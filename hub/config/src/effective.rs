@@ -3,7 +3,7 @@
 use std::fmt;
 
 use scanhub_drivers::AUTO;
-use schema::{Failure, Family};
+use scanhub_schema::{Failure, Family};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 
@@ -29,7 +29,7 @@ pub struct Value {
 
 /// Returns all values of links, limits and gateway from `sources`.
 ///
-/// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
+/// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
     let sources = sources.read();
     let merged = Merged::of(&sources)?;

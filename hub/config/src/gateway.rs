@@ -4,8 +4,8 @@
 
 use std::path::PathBuf;
 
-use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
-use schema::limits::TopicLimits;
+use scanhub_schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::limits::TopicLimits;
 use serde_json::{Value as Json, json};
 
 use crate::section::{Section, optional, section, whole_or};

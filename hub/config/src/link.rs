@@ -1,9 +1,9 @@
 //! The links of a hub, each with its port and the settings of its sensor: keys of the sources and values in effect.
 
-use port::Source;
 use scanhub_drivers::{Features, Settings, scan_heads};
-use schema::limits::TopicLimits;
-use schema::{Background, Failure, Family, ScanHead, check_sensor};
+use scanhub_port::Source;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Background, Failure, Family, ScanHead, check_sensor};
 
 use crate::processing::{
     BackgroundKeys, EarlyKeys, LinesKeys, MarksKeys, MotionKeys, PoseKeys, Processing, ZonesKeys,
@@ -223,9 +223,9 @@ pub(crate) const MAX_LINKS: usize = 256;
 
 /// Shared memory and descriptors that links need.
 pub mod needs {
-    use schema::Topic;
-    use schema::limits::TopicLimits;
-    use shm::shortage::{self, sensor_bytes};
+    use scanhub_schema::Topic;
+    use scanhub_schema::limits::TopicLimits;
+    use scanhub_shm::shortage::{self, sensor_bytes};
 
     /// Returns the number of bytes of shared memory for links with topics for `limits`, and their first subscribers.
     pub fn memory(limits: &[TopicLimits]) -> u64 {

@@ -4,9 +4,9 @@
 use std::ops::Range;
 use std::path::Path;
 
-use port::{Source, is_same_line};
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind};
+use scanhub_port::{Source, is_same_line};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use toml::Spanned;
@@ -279,7 +279,7 @@ impl Config {
     ///
     /// # Errors
     ///
-    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if there is no
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if there is no
     /// link.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         Config::of(&sources.read())
@@ -300,7 +300,7 @@ impl Gateway {
     ///
     /// # Errors
     ///
-    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
     pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
         Gateway::of(&sources.read())
     }

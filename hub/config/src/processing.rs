@@ -3,12 +3,12 @@
 
 use std::path::PathBuf;
 
-use preprocess::background::{Candidate, Method, Settings as Learning, Start};
-use preprocess::zones::{Check, SECTORS, Sector};
-use preprocess::{lines, marks, motion, zones};
 use scanhub_drivers::features;
 use scanhub_files::regular;
-use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, Scan, ScanHead, ZONES};
+use scanhub_preprocess::background::{Candidate, Method, Settings as Learning, Start};
+use scanhub_preprocess::zones::{Check, SECTORS, Sector};
+use scanhub_preprocess::{lines, marks, motion, zones};
+use scanhub_schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, Scan, ScanHead, ZONES};
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use toml::de::DeTable;
@@ -94,7 +94,7 @@ pub struct Background {
     /// Whether the learned background is saved for the next hub, which starts with it.
     pub is_handed_on: bool,
     /// Background to start with: the contents of the file, or the background of an earlier hub.
-    pub model: Option<Box<schema::Background>>,
+    pub model: Option<Box<scanhub_schema::Background>>,
     /// Whether the model is published with every scan, and not only for a new generation and after a period of
     /// learning.
     pub every_scan: bool,
@@ -610,7 +610,7 @@ pub(crate) fn check_coverage(
         let of_head = |head: &ScanHead| {
             let beams = usize::from(head.count);
             let mut check = Check::new(processing.pose, settings, beams);
-            check.update(&Scan::of(*head, &vec![0; beams]), &mut schema::Zones::unknown());
+            check.update(&Scan::of(*head, &vec![0; beams]), &mut scanhub_schema::Zones::unknown());
             check.telling()
         };
         link.scan_heads().iter().map(of_head).max().unwrap_or_default()

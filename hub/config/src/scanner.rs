@@ -1,11 +1,11 @@
 //! The scanner of a link: its family and settings, as values in effect and as keys of the sources. The family checks the
 //! settings; this module knows where each one is set.
 
-use port::Source;
 use scanhub_drivers::{
     ANY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of, features,
 };
-use schema::{Failure, Family};
+use scanhub_port::Source;
+use scanhub_schema::{Failure, Family};
 use serde_json::Value as Json;
 use toml::Spanned;
 use toml::de::DeTable;
@@ -140,7 +140,7 @@ pub(crate) struct ScannerRequest<'a> {
 impl<'a> ScannerRequest<'a> {
     /// Returns the request of `keys`, which were read from `table`.
     ///
-    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if no scanner can have a value.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if no scanner can have a value.
     pub(crate) fn of(
         keys: &LinkKeys,
         table: &'a DeTable<'a>,

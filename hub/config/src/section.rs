@@ -7,7 +7,7 @@
 use std::borrow::Borrow;
 use std::ops::RangeInclusive;
 
-use schema::Failure;
+use scanhub_schema::Failure;
 use serde_json::Value as Json;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -110,7 +110,7 @@ pub(crate) trait Section {
 
     /// Checks the values, which were read from `table`.
     ///
-    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if one is not valid.
+    /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if one is not valid.
     fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
         let Some((key, Refused { what, remedy, at })) = self.refused() else { return Ok(()) };
         let list = find(table, key);

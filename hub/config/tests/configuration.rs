@@ -4,10 +4,10 @@
 use scanhub_drivers::features;
 use std::fs;
 
-use config::{Config, Gateway, Processing, Sources};
-use preprocess::background::{Candidate, Method, Start};
-use preprocess::zones::Sector;
-use schema::{Background, BackgroundHead, Family, Kind, as_json};
+use scanhub_config::{Config, Gateway, Processing, Sources};
+use scanhub_preprocess::background::{Candidate, Method, Start};
+use scanhub_preprocess::zones::Sector;
+use scanhub_schema::{Background, BackgroundHead, Family, Kind, as_json};
 use tempfile::TempPath;
 
 /// A temporary file.
@@ -70,19 +70,19 @@ fn the_page_holds() {
 #[test]
 fn the_default_has_a_section_for_each_family() {
     let is_setting = |line: &&str| *line == "[[link]]" || line.contains(" = ");
-    let all: Vec<&str> = config::DEFAULT
+    let all: Vec<&str> = scanhub_config::DEFAULT
         .lines()
         .map(|line| line.strip_prefix("# ").filter(is_setting).unwrap_or(line))
         .collect();
     let file = Scratch::new("default.toml", all.join("\n"));
     let config = load(&[&file], &[]).unwrap_or_else(|refusal| panic!("{refusal}"));
-    let families: Vec<Family> = config.links.iter().filter_map(config::Link::family).collect();
+    let families: Vec<Family> = config.links.iter().filter_map(scanhub_config::Link::family).collect();
     // The last one is a recording.
     assert_eq!(families.split_last().map(|(_, live)| live), Some(&Family::ALL[..]));
     for features in Family::ALL.into_iter().map(features) {
         let names = features.models.iter().map(|model| model.name).chain(features.modes.iter().copied());
         for name in names {
-            assert!(config::DEFAULT.contains(name), "{name} is missing");
+            assert!(scanhub_config::DEFAULT.contains(name), "{name} is missing");
         }
     }
 }

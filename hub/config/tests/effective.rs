@@ -3,7 +3,7 @@
 
 use std::fs;
 
-use config::{Config, DEFAULT, Gateway, Sources, Value, values};
+use scanhub_config::{Config, DEFAULT, Gateway, Sources, Value, values};
 use serde_json::{Value as Json, json};
 use tempfile::TempPath;
 
@@ -192,7 +192,7 @@ fn default_file_sets_the_defaults_and_shows_every_family() {
     assert!(unset.is_empty(), "not in the default file: {unset:?}");
     let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
     let families: Vec<_> = all.links.iter().filter_map(|link| link.family()).collect();
-    assert_eq!(families[..3], schema::Family::ALL);
+    assert_eq!(families[..3], scanhub_schema::Family::ALL);
     let scanner = &all.links[1].scanner;
     assert!(scanner.settings.expected_type.is_some() && scanner.settings.unit_mm.is_some());
 }

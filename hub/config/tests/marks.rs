@@ -1,7 +1,7 @@
 //! From which intensity on a beam belongs to a mark is said in another key for reflector levels than for counts of any
 //! surface: what does not fit a link is refused where it is said for it alone.
 
-use config::{Config, Link, Sources, values};
+use scanhub_config::{Config, Link, Sources, values};
 
 fn sources(set: &[&str]) -> Sources {
     let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();

@@ -4,9 +4,9 @@
 use std::fs;
 use std::path::Path;
 
-use config::{Key, keys};
+use scanhub_config::{Key, keys};
 use scanhub_drivers::{AUTO, Features, features};
-use schema::Family;
+use scanhub_schema::Family;
 
 /// Head of the default configuration.
 const HEAD: &str = "\

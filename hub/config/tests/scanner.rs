@@ -1,9 +1,9 @@
 //! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value
 //! and remedy.
 
-use config::{Config, Link, Sources};
+use scanhub_config::{Config, Link, Sources};
 use scanhub_drivers::{Settings, features};
-use schema::{Family, Kind};
+use scanhub_schema::{Family, Kind};
 
 fn load(set: &[&str]) -> Result<Config, String> {
     let sources = Sources {
@@ -224,7 +224,7 @@ fn a_family_may_be_searched_for() {
     assert_eq!(front(&["link.front.family=auto"]).unwrap(), link, "it is the default");
     assert_eq!((link.family(), link.max_beams(), link.rate()), (None, 3_240, 230_400));
     assert!(link.scanner.is_auto());
-    let limits = link.limits(&schema::limits::TopicLimits::default());
+    let limits = link.limits(&scanhub_schema::limits::TopicLimits::default());
     for family in Family::ALL.into_iter().map(features) {
         assert!(family.models.iter().all(|model| model.beams <= limits.beams));
         assert!(
@@ -236,7 +236,7 @@ fn a_family_may_be_searched_for() {
         assert_eq!(front(set).unwrap().family(), None, "{set:?}");
     }
     let remedy = "family = \"auto\" needs the most: set link.front.family to one of lms, ld, rplidar";
-    let short = || schema::Failure::new(Kind::Short, "shared memory is short", "free some of it");
+    let short = || scanhub_schema::Failure::new(Kind::Short, "shared memory is short", "free some of it");
     assert_eq!(load(&[]).unwrap().with_remedy(short()).hint, format!("free some of it; {remedy}"));
     let named = load(&["link.front.family=ld", "link.rear.family=lms"]).unwrap();
     assert_eq!(named.with_remedy(short()), short());

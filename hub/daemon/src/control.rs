@@ -5,19 +5,19 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use config::Processing;
+use scanhub_config::Processing;
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Session as _};
-use schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb};
-use shm::shortage;
-use shm::{Asked, Node};
+use scanhub_schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb};
+use scanhub_shm::shortage;
+use scanhub_shm::{Asked, Node};
 
 use crate::player::Player;
 use crate::process::EventFd;
 
 /// The server of control requests. It belongs to the supervising thread.
 pub(crate) struct ControlServer {
-    server: shm::ControlServer,
+    server: scanhub_shm::ControlServer,
     pub(crate) commands: CommandSender,
     /// Requests whose link has not reported an outcome yet, with their numbers.
     open: Vec<(u64, Asked)>,
@@ -142,14 +142,14 @@ impl ControlServer {
         node: &Node,
         sensors: impl Iterator<Item = &'a str>,
     ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
-        let server = shm::ControlServer::create(node)?;
+        let server = scanhub_shm::ControlServer::create(node)?;
         let (commands, queues) = CommandSender::new(sensors)?;
         Ok((ControlServer { server, commands, open: Vec::new() }, queues))
     }
 
     /// Descriptors that become readable when [`serve`](Self::serve) has something to do.
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [shm::descriptor(self.server.requests()), self.commands.event.as_fd()]
+        [scanhub_shm::descriptor(self.server.requests()), self.commands.event.as_fd()]
     }
 
     /// Replies to the requests that links have handled, and queues new ones.
@@ -162,7 +162,7 @@ impl ControlServer {
             }
         }
         self.open.retain(|(_, asked)| asked.is_waited_for());
-        let mut was_signaled = shm::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
+        let mut was_signaled = scanhub_shm::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
         loop {
             match self.server.receive() {
                 Ok(Some(asked)) => {

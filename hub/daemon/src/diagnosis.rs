@@ -11,11 +11,11 @@
 
 use std::path::Path;
 
-use config::Link;
-use port::{Alteration, Source};
+use scanhub_config::Link;
 use scanhub_drivers::line::{Notice, Session as _};
 use scanhub_drivers::{PortSession, Trouble, line, search};
-use schema::{Family, MILLIS, Nanos, State, Status};
+use scanhub_port::{Alteration, Source};
+use scanhub_schema::{Family, MILLIS, Nanos, State, Status};
 
 use crate::link_stats::LineHealth;
 

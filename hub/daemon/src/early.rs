@@ -3,9 +3,9 @@
 //! warning is slow or stop, never clear. It is withdrawn if its scan is not published, or if a later part of the scan
 //! refutes it.
 
-use preprocess::zones::{Check, Warning};
 use scanhub_drivers::line::RawScan;
-use schema::{Contents, Early, Scan, Verdict};
+use scanhub_preprocess::zones::{Check, Warning};
+use scanhub_schema::{Contents, Early, Scan, Verdict};
 
 /// Warns of objects in the scan that is arriving.
 pub(crate) struct EarlyWarner {
@@ -97,10 +97,10 @@ const _: () = assert!((Verdict::Slow as u8) < Verdict::Stop as u8);
 #[cfg(test)]
 mod tests {
     use fastrand::Rng;
-    use preprocess::zones::{Sector, Settings};
     use scanhub_drivers::line::grid::{NO_RETURN, Point};
     use scanhub_drivers::line::{Values, revolution_head};
-    use schema::{Family, Pose, Zones};
+    use scanhub_preprocess::zones::{Sector, Settings};
+    use scanhub_schema::{Family, Pose, Zones};
 
     use super::*;
 

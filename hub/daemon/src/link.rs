@@ -1,10 +1,10 @@
 //! The parts of a link that do not depend on the source of its bytes: topics, status, diagnosis, requests of users, and
 //! deadlines for publishing without new bytes.
 
-use config::{Link, Processing};
+use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
 use scanhub_drivers::{PortSession, Trouble};
-use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
+use scanhub_schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, PauseTarget};
 use crate::diagnosis::Diagnosis;

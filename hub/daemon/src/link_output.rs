@@ -5,9 +5,9 @@
 //! same path, `LinkOutput::publish_scan`: decode, zones, send, ring, the other processors, send. The last ring follows
 //! when all samples of the telegram are sent. Nothing on this path allocates, locks or logs.
 
-use config::{Link, Processing};
+use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
-use schema::{
+use scanhub_schema::{
     Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Ring, Scan, Verb, Wake, Zones,
 };
 
@@ -387,7 +387,7 @@ fn decode(raw: &RawScan<'_>, scan: &mut Box<Scan>) {
 
 /// Returns a period in microseconds.
 pub(crate) fn micros(period: Nanos) -> u32 {
-    u32::try_from(period / schema::MICROS).unwrap_or(u32::MAX)
+    u32::try_from(period / scanhub_schema::MICROS).unwrap_or(u32::MAX)
 }
 
 /// Returns how long after a scan the verdict on it is valid, if scans arrive every `period_us`.
@@ -396,6 +396,6 @@ pub(crate) fn verdict_lifetime(period_us: u32) -> Nanos {
 }
 
 /// A verdict is valid for two scan periods and this time.
-const GRACE: Nanos = 20 * schema::MILLIS;
+const GRACE: Nanos = 20 * scanhub_schema::MILLIS;
 /// Validity of a verdict without a known scan period: two LMS scans of 361 beams at 38,400 baud, and [`GRACE`].
-const UNKNOWN_PERIOD_LIFETIME: Nanos = 480 * schema::MILLIS;
+const UNKNOWN_PERIOD_LIFETIME: Nanos = 480 * scanhub_schema::MILLIS;

@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
-use config::{Link, Processing};
+use scanhub_config::{Link, Processing};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::Session as _;
-use schema::{Counter, Counters, Family, MILLIS, MIN_RATE_SPAN, Nanos, State, Status};
+use scanhub_schema::{Counter, Counters, Family, MILLIS, MIN_RATE_SPAN, Nanos, State, Status};
 
 use crate::link_output::Published;
 

@@ -3,14 +3,14 @@
 
 use std::fmt;
 
-use config::Processing;
-use preprocess::background::{Method, Mismatch, Model};
-use preprocess::lines::LineFinder;
-use preprocess::marks::MarkDetector;
-use preprocess::motion::MotionEstimator;
-use preprocess::segments::Segmenter;
-use preprocess::zones::Check;
-use schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
+use scanhub_config::Processing;
+use scanhub_preprocess::background::{Method, Mismatch, Model};
+use scanhub_preprocess::lines::LineFinder;
+use scanhub_preprocess::marks::MarkDetector;
+use scanhub_preprocess::motion::MotionEstimator;
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_preprocess::zones::Check;
+use scanhub_schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
 /// The processors of one link. They process suspect scans like clean ones: a suspected obstacle counts, and a
 /// background needs hundreds of scans in agreement, so that a bad one among them does no harm.
@@ -331,7 +331,7 @@ impl BackgroundStage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{BackgroundHead, ScanHead, Verdict};
+    use scanhub_schema::{BackgroundHead, ScanHead, Verdict};
 
     fn processing(change: impl FnOnce(&mut Processing)) -> Processing {
         let mut processing = Processing::default();
@@ -463,7 +463,7 @@ mod tests {
         assert!(!pipeline.is_background_due(), "the background is not concerned");
         assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
         pipeline.change(&processing(|processing| {
-            processing.background.learning.method = preprocess::background::Method::Paper;
+            processing.background.learning.method = scanhub_preprocess::background::Method::Paper;
             processing.background.learning.threshold_mm = Some(1500);
         }));
         let changed = shown(&mut pipeline);

@@ -6,9 +6,9 @@
 use std::io;
 use std::path::Path;
 
-use port::{Allowance, Alteration, PortError, Source};
-use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
-use shm::{Medium, Payload};
+use scanhub_port::{Allowance, Alteration, PortError, Source};
+use scanhub_schema::{Background, Failure, Nanos, Pose, Ring, Wake};
+use scanhub_shm::{Medium, Payload};
 
 use crate::control::ControlQueue;
 use crate::saved_state::{KnownRate, KnownScanner};
@@ -33,7 +33,7 @@ pub trait Platform {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](schema::Kind) if another process publishes under it. The link then publishes without
+    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes under it. The link then publishes without
     /// waking its subscribers, which poll ten times a second.
     fn take_name(&self) -> Result<(), Failure>;
 
@@ -65,7 +65,7 @@ pub trait Platform {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`SharedMemory::new`](shm::SharedMemory::new).
+    /// Returns the errors of [`SharedMemory::new`](scanhub_shm::SharedMemory::new).
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
 
     /// Rings the doorbell word `ring` of the link, which wakes the subscribers that sleep there.

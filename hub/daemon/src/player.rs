@@ -9,8 +9,8 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use port::clock;
-use schema::{Failure, Nanos};
+use scanhub_port::clock;
+use scanhub_schema::{Failure, Nanos};
 
 use crate::process::EventFd;
 use crate::replay::RecordedMount;
@@ -135,7 +135,7 @@ impl Player {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](schema::Kind) if no descriptors are left.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if no descriptors are left.
     pub(crate) fn new(
         play: PlaybackOptions,
         links: usize,
@@ -669,13 +669,13 @@ fn next_of(links: &[Next]) -> Option<Nanos> {
 }
 
 /// Maximum media time that passes while all links are silent.
-const MAX_SILENCE: Nanos = 10_000 * schema::MILLIS;
+const MAX_SILENCE: Nanos = 10_000 * scanhub_schema::MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const SECOND: Nanos = 1_000 * schema::MILLIS;
+    const SECOND: Nanos = 1_000 * scanhub_schema::MILLIS;
 
     /// Creates a playback of `links` links that was started at 100 s.
     fn begun(links: usize, play: PlaybackOptions) -> Playback {

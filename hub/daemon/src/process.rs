@@ -9,13 +9,13 @@ use std::io::Read;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 
-use config::needs;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::{Mode, OFlags, open};
 use rustix::stdio::{stderr, stdout};
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind};
-use shm::shortage;
+use scanhub_config::needs;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::shortage;
 use signal_hook::consts::{SIGBUS, SIGHUP, SIGINT, SIGTERM};
 use signal_hook::low_level;
 use signal_hook::low_level::pipe::register;

@@ -1,9 +1,9 @@
 //! Publisher of one topic of a link. It takes the loan for a sample before the sample arrives, so that a telegram does
 //! not have to wait for memory.
 
-use schema::limits::history;
-use schema::{Failure, Header};
-use shm::{DueRings, Medium, Payload, TopicPublisher};
+use scanhub_schema::limits::history;
+use scanhub_schema::{Failure, Header};
+use scanhub_shm::{DueRings, Medium, Payload, TopicPublisher};
 
 use crate::platform::Platform;
 
@@ -35,7 +35,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
     pub(crate) fn new(platform: &impl Platform<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
         let topic = TopicPublisher::over(platform.medium::<P>(sensor)?);
         Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })

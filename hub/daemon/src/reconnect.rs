@@ -4,10 +4,10 @@
 
 use std::io;
 
-use port::{PortError, Source};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
-use schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
+use scanhub_port::{PortError, Source};
+use scanhub_schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, PauseTarget};
 use crate::link::LinkCore;
@@ -59,12 +59,12 @@ impl<'a, S: Platform> LiveLink<'a, S> {
     ///
     /// # Errors
     ///
-    /// Returns an error of kind [`PortNotTty`](schema::Kind::PortNotTty) if the port is not a serial line at all, an
-    /// error of kind [`Short`](schema::Kind::Short) if descriptors or memory run out, and those of
+    /// Returns an error of kind [`PortNotTty`](scanhub_schema::Kind::PortNotTty) if the port is not a serial line at all, an
+    /// error of kind [`Short`](scanhub_schema::Kind::Short) if descriptors or memory run out, and those of
     /// [`Platform::medium`]. The link waits for a port that is missing, in use or forbidden, or that cannot have the
     /// rate, and for a name that another process has.
     pub fn new(
-        link: &'a config::Link,
+        link: &'a scanhub_config::Link,
         number: u8,
         boot: u64,
         platform: &'a S,

@@ -2,8 +2,8 @@
 //! is lost. Settings of a line wait for the next start of the hub, which the log says. An invalid configuration
 //! changes nothing.
 
-use config::{Background, Config, Link, Processing};
-use schema::{Failure, Nanos};
+use scanhub_config::{Background, Config, Link, Processing};
+use scanhub_schema::{Failure, Nanos};
 
 use crate::control::CommandSender;
 use crate::service::Service;
@@ -141,8 +141,8 @@ fn merged(old: &Processing, new: &Processing) -> Processing {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use config::Sources;
-    use preprocess::background::Start;
+    use scanhub_config::Sources;
+    use scanhub_preprocess::background::Start;
 
     fn config(links: &[&str], set: &[&str]) -> Config {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();

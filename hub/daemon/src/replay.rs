@@ -16,11 +16,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use port::clock;
-use recording::{Frame, MountRecord, Recording};
 use scanhub_drivers::line::{Event, Output, Protocol as _};
 use scanhub_drivers::{PortSession, Settings};
-use schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
+use scanhub_port::clock;
+use scanhub_recording::{Frame, MountRecord, Recording};
+use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 
 use crate::control::PauseTarget;
 use crate::link::LinkCore;

@@ -3,12 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use config::{Config, Sources};
-use port::Source;
-use recording::Recording;
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::Model;
-use schema::{Failure, Family, Kind, Nanos, check_sensor};
-use shm::Domain;
+use scanhub_port::Source;
+use scanhub_recording::Recording;
+use scanhub_schema::{Failure, Family, Kind, Nanos, check_sensor};
+use scanhub_shm::Domain;
 
 use crate::player::{PlaybackOptions, Player, Progress};
 use crate::replay::{Origin, Recorded, RecordedMount, log_damage};

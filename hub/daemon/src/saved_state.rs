@@ -12,16 +12,16 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use config::{Config, Link};
-use port::{Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
+use scanhub_config::{Config, Link};
 pub use scanhub_drivers::line::KnownRate;
 use scanhub_drivers::line::grid::BEAMS;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{Model, features};
-use schema::{Age, Background, Failure, Family, Kind, MILLIS, Nanos, Pose, SavedModel, as_json};
+use scanhub_port::{Source, clock};
+use scanhub_schema::{Age, Background, Failure, Family, Kind, MILLIS, Nanos, Pose, SavedModel, as_json};
+use scanhub_shm::StateDirectory;
 use serde::{Deserialize, Serialize};
-use shm::StateDirectory;
 
 use crate::platform::SavedState;
 use crate::process::{EventFd, no_resource};
@@ -564,8 +564,8 @@ const SILENT: &str = ",silent=";
 #[cfg(test)]
 mod tests {
     use super::*;
-    use config::Sources;
-    use schema::BackgroundHead;
+    use scanhub_config::Sources;
+    use scanhub_schema::BackgroundHead;
 
     const PORT: &str = "/dev/serial/by-id/usb-FTDI 1";
 

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use rustix::io::{FdFlags, fcntl_setfd};
-use schema::Nanos;
+use scanhub_schema::Nanos;
 use sd_notify::NotifyState;
 
 /// The service manager. Without one, as by default, all functions have no effect.

@@ -13,11 +13,11 @@
 use std::fmt;
 use std::io;
 
-use port::{Allowance, LineErrors, Source};
 use scanhub_drivers::line::{self, Event, Identity, Output, Protocol as _, Session as _, suspect};
 use scanhub_drivers::search::{Memory, Search};
 use scanhub_drivers::{Model, PortSession};
-use schema::{MILLIS, Nanos, State, Status, line_time};
+use scanhub_port::{Allowance, LineErrors, Source};
+use scanhub_schema::{MILLIS, Nanos, State, Status, line_time};
 
 use crate::control::PauseTarget;
 use crate::link::LinkCore;

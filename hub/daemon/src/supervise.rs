@@ -7,12 +7,12 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc;
 use std::thread;
 
-use config::{Config, Link};
-use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
-use schema::{Failure, Kind, MILLIS, Nanos};
-use shm::Node;
-use shm::{Domain, HubLock, StateDirectory};
+use scanhub_config::{Config, Link};
+use scanhub_port::{Port, Source, clock};
+use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
+use scanhub_shm::Node;
+use scanhub_shm::{Domain, HubLock, StateDirectory};
 
 use crate::control::{ControlQueue, ControlServer};
 use crate::link::LinkCore;
@@ -134,7 +134,7 @@ pub(crate) fn serve(
     };
     let writer = saver.map(StateWriter::start).transpose()?;
     let config = &config;
-    let node = shm::hub_node(domain)?;
+    let node = scanhub_shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let boot = random();
     // By the port, not by the name: a line that the service manager keeps cannot be opened again.
@@ -197,7 +197,7 @@ pub(crate) fn serve(
                 waiting: names(|start| *start != Start::Open),
                 taken: names(|start| *start == Start::Taken),
             };
-            shm::allocate(domain)?;
+            scanhub_shm::allocate(domain)?;
             lock.report_ready()?;
             on_ready(&ready);
             service.ready(&ready.sensors, None);

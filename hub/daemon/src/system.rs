@@ -9,12 +9,12 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::limits::TopicLimits;
-use schema::{Failure, MILLIS, Nanos, Ring, Wake};
-use shm::{Directory, NameLock};
-use shm::{Node, Payload, SharedMemory, Waker};
+use scanhub_port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, MILLIS, Nanos, Ring, Wake};
+use scanhub_shm::{Directory, NameLock};
+use scanhub_shm::{Node, Payload, SharedMemory, Waker};
 
 use crate::control::ControlQueue;
 use crate::link::LinkCore;
@@ -214,7 +214,7 @@ impl Platform for System<'_> {
 
     fn altering_program(&self, source: &Source) -> Option<String> {
         match source {
-            Source::Tty(path) => port::altering_program(path),
+            Source::Tty(path) => scanhub_port::altering_program(path),
             Source::Tcp { .. } | Source::File { .. } => None,
         }
     }

@@ -5,12 +5,12 @@
 //! the samples of a scan.
 
 use scanhub_drivers::line::Received;
-use schema::limits::history;
-use schema::{
+use scanhub_schema::limits::history;
+use scanhub_schema::{
     Background, Failure, Family, Flags, Header, MILLIS, Nanos, Pace, Quality, Ring, Status, Topic, Wake,
     Zones,
 };
-use shm::DueRings;
+use scanhub_shm::DueRings;
 
 use crate::early::EarlyMessage;
 use crate::platform::Platform;
@@ -22,7 +22,7 @@ macro_rules! publishers {
         pub(crate) struct Publishers<S: Platform> {
             $(
                 #[doc = $about]
-                pub(crate) $name: Publisher<schema::payload_type!($payload), S>,
+                pub(crate) $name: Publisher<scanhub_schema::payload_type!($payload), S>,
             )*
         }
 
@@ -64,7 +64,7 @@ macro_rules! publishers {
     };
 }
 
-schema::for_each_topic!(links: publishers);
+scanhub_schema::for_each_topic!(links: publishers);
 
 /// Publisher of one topic.
 type Publisher<P, S> = PreparedPublisher<P, <S as Platform>::Medium<P>>;
@@ -92,7 +92,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
     pub(crate) fn new(platform: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
@@ -161,7 +161,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.header.flags |= if received.estimated || is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
-    /// Sets the stamps, the period, and the [`Reasons`](schema::Reasons) for a revolution that the last packet completed.
+    /// Sets the stamps, the period, and the [`Reasons`](scanhub_schema::Reasons) for a revolution that the last packet completed.
     /// `first` and `last` are the times of its first and last beam.
     pub(crate) fn begin_revolution(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         self.begin(first, last, reasons, period_us);
@@ -195,7 +195,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Publishes an early warning and wakes its subscribers. `first` and `last` are the times of the measured part of
-    /// the scan. `reasons` are the [`Reasons`](schema::Reasons) so far.
+    /// the scan. `reasons` are the [`Reasons`](scanhub_schema::Reasons) so far.
     pub(crate) fn early(
         &mut self,
         message: &EarlyMessage,

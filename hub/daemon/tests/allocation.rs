@@ -11,21 +11,21 @@ use std::sync::mpsc::channel;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use config::{Config, Sources};
 use counting::{HELD, TAKEN, WATCHED};
 use rustix::fs::{OFlags, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::tcgetattr;
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::reply::{self, Health};
 use scanhub_drivers::lms::telegram::{ACK, Encoded, FRAME, MAX_TELEGRAM, STX, Telegram};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::{Foreground, Marks, Scan};
-use shm::Domain;
-use shm::{Payload, Subscriber};
+use scanhub_schema::{Foreground, Marks, Scan};
+use scanhub_shm::Domain;
+use scanhub_shm::{Payload, Subscriber};
 
 /// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
 /// has another rate, and it streams until it gets a request to stop.
@@ -224,10 +224,12 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
     let (send, ready) = channel();
     let hub = thread::spawn({
         let domain = domain.clone();
-        move || daemon::run(&|| Config::load(&sources), &domain, |_| send.send(()).unwrap_or_default())
+        move || {
+            scanhub_daemon::run(&|| Config::load(&sources), &domain, |_| send.send(()).unwrap_or_default())
+        }
     });
     ready.recv_timeout(Duration::from_secs(60)).expect("the hub is up");
-    let node = shm::client_node(domain).expect("a node");
+    let node = scanhub_shm::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
     let subscriber = Scan::subscriber(&topic).expect("a subscriber");
     let followers = follow_all.then(|| {

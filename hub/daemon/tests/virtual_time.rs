@@ -8,12 +8,12 @@ use std::fmt;
 use std::fs;
 use std::sync::{Arc, Mutex};
 
-use config::{Config, Sources};
+use scanhub_config::{Config, Sources};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::Unit;
-use schema::{Family, Marks, Scan, State, Status};
-use shm::Domain;
-use shm::Payload;
+use scanhub_schema::{Family, Marks, Scan, State, Status};
+use scanhub_shm::Domain;
+use scanhub_shm::Payload;
 use tracing::field::{Field, Visit};
 use tracing::span;
 use tracing::{Event, Metadata, Subscriber};
@@ -54,7 +54,7 @@ fn two_links() -> Config {
 fn bytes_with_times_become_samples_with_stamps() {
     let place = Place::new('m');
     let received = virtual_hub(&two_links(), &place.0, |links| {
-        let node = shm::client_node(&place.0).expect("a node");
+        let node = scanhub_shm::client_node(&place.0).expect("a node");
         let service = Scan::open(&node, "b").expect("a topic").expect("is there");
         let subscriber = Scan::subscriber(&service).expect("a subscriber");
         let mut received = Vec::new();
@@ -85,7 +85,7 @@ fn bytes_with_times_become_samples_with_stamps() {
 fn what_nobody_follows_is_not_made_and_a_status_tells_that_it_streams() {
     let place = Place::new('n');
     let outcome = virtual_hub(&two_links(), &place.0, |links| {
-        let node = shm::client_node(&place.0).expect("a node");
+        let node = scanhub_shm::client_node(&place.0).expect("a node");
         let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
         assert_eq!(links[0].read(1, telegram.bytes()), 1);
         let marks = Marks::open(&node, "a").expect("a topic").expect("is there");
@@ -150,7 +150,7 @@ fn a_rate_that_the_port_rejects_is_logged_once_and_the_scanner_is_found() {
     let log = Log::default();
     let outcome = tracing::subscriber::with_default(log.clone(), || {
         virtual_hub(&config, &place.0, |links| {
-            let node = shm::client_node(&place.0).expect("a node");
+            let node = scanhub_shm::client_node(&place.0).expect("a node");
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
             let status = Status::subscriber(&status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);

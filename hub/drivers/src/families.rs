@@ -10,7 +10,7 @@ use crate::line::{
 use crate::lms::Inquiry;
 use crate::settings::{Refusal, Settings, SettingsRequest};
 use crate::{ld, lms, rplidar, search};
-use schema::{Counters, Family, Nanos, ScanHead, Status};
+use scanhub_schema::{Counters, Family, Nanos, ScanHead, Status};
 
 /// Declares the families, each with its name and its module, in the order in which the search looks for them.
 macro_rules! families {
@@ -225,9 +225,9 @@ const _: () = {
     }
 };
 const _: () = assert!(
-    line::suspect::LINE_ERROR == schema::Reasons::LINE_ERROR
-        && line::suspect::NEIGHBOUR == schema::Reasons::NEIGHBOUR
-        && line::suspect::SLOW == schema::Reasons::SLOW
-        && line::suspect::FORBIDDEN_BITS == schema::Reasons::FORBIDDEN_BITS
-        && line::suspect::HEADER_INSIDE == schema::Reasons::HEADER_INSIDE
+    line::suspect::LINE_ERROR == scanhub_schema::Reasons::LINE_ERROR
+        && line::suspect::NEIGHBOUR == scanhub_schema::Reasons::NEIGHBOUR
+        && line::suspect::SLOW == scanhub_schema::Reasons::SLOW
+        && line::suspect::FORBIDDEN_BITS == scanhub_schema::Reasons::FORBIDDEN_BITS
+        && line::suspect::HEADER_INSIDE == scanhub_schema::Reasons::HEADER_INSIDE
 );

@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
+use scanhub_schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
 
 use crate::families::{Session, Trouble, features};
 use crate::line::family::{Features, Model};

@@ -1,6 +1,6 @@
 //! Recognizes the family of raw bytes, such as those of a stream file, by the bytes that the framer of each family accepts.
 
-use schema::{Family, MILLIS, Nanos};
+use scanhub_schema::{Family, MILLIS, Nanos};
 
 use crate::line::{Event, Output, Protocol as _, Session as _};
 use crate::lms::framer::{Framer, VETO_HOLD};

@@ -18,7 +18,7 @@
 
 use core::fmt;
 
-use schema::{Family, MILLIS, Nanos, line_time};
+use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::families::probes;
 use crate::line::probe::{Approach, Asks, Evidence, Probe};

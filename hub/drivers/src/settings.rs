@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use schema::Family;
+use scanhub_schema::Family;
 
 use crate::families::{check, features};
 use crate::line::family::Features;

@@ -12,7 +12,7 @@ use scanhub_drivers::lms::framer::TelegramSpan;
 use scanhub_drivers::lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Encoded;
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::eeprom::{PowerOn, Write};
 use crate::plan::{Consent, OwnedConfiguration, Plan};

@@ -1,11 +1,11 @@
 //! Any bytes at all, as telegrams with a right checksum: nothing panics, what was understood as a write is said again as it
 //! came and is no request, and what is explained of it is what it says.
 
-use lms_configure::eeprom::{PowerOn, Write};
 use proptest::prelude::*;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::explain::explain;
 use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
+use scanhub_lms_configure::eeprom::{PowerOn, Write};
 
 fn telegram(address: u8, command: u8, data: &[u8]) -> Encoded {
     Writer::new(address, command).slice(data).finish()

@@ -2,7 +2,7 @@
 
 use rustix::event::Timespec;
 use rustix::time::{ClockId, clock_gettime};
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 /// CLOCK_MONOTONIC, the clock of every stamp and deadline.
 pub fn now() -> Nanos {

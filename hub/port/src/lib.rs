@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use rustix::io::Errno;
-use schema::Failure;
+use scanhub_schema::Failure;
 
 pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
 pub use candidates::{
@@ -326,7 +326,7 @@ fn write_all(fd: impl AsFd, mut bytes: &[u8]) -> Result<(), Errno> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Kind;
+    use scanhub_schema::Kind;
     use std::io::Read as _;
     use std::os::unix::net::UnixStream;
 

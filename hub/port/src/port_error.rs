@@ -6,7 +6,7 @@ use std::io;
 use std::path::Path;
 
 use rustix::io::Errno;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use super::access::{Holder, Rights, holder, is_own, lock_owner};
 use super::candidates::{Candidate, candidates};

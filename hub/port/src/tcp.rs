@@ -19,8 +19,8 @@ use rustix::net::sockopt::{
     set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl, set_tcp_nodelay,
     set_tcp_user_timeout,
 };
-use schema::{MILLIS, Nanos, line_time};
-use shm::shortage;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_shm::shortage;
 
 use crate::{Port, PortError, write_all};
 

@@ -9,7 +9,7 @@ mod moving;
 use std::f64::consts::TAU;
 use std::fmt;
 
-use schema::{
+use scanhub_schema::{
     Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Motion, Pose, Scan, ScanHead,
 };
 
@@ -78,7 +78,7 @@ pub enum Start {
 /// The settings in the units of the scans.
 #[derive(Clone, Copy, Debug)]
 struct Limits {
-    /// In device units. Low enough that no range is near [`schema::Background::FAR`].
+    /// In device units. Low enough that no range is near [`scanhub_schema::Background::FAR`].
     threshold: u16,
     /// In device units.
     candidate: u16,
@@ -102,7 +102,7 @@ const THRESHOLD_DM_MODE_MM: u16 = 100;
 const TEN_SECONDS_NS: f64 = 9.99e9;
 /// Maximum that the weights of `multi` have room for: eight per scan in 16 bits.
 const MOST_SCANS: u32 = 8191;
-/// Maximum difference of two ranges. [`schema::Background::FAR`] differs by more from all of them.
+/// Maximum difference of two ranges. [`scanhub_schema::Background::FAR`] differs by more from all of them.
 const FARTHEST: u32 = 0x7FFF;
 /// Maximum rounding error of a quotient: a whole number stays that number.
 const ROUNDING: f64 = 1e-6;

@@ -15,7 +15,7 @@ mod join;
 
 use std::f32::consts::{PI, TAU};
 
-use schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
+use scanhub_schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
 
 use cut::{Bounds, Cutter};
 use fit::{Information, Ray};

@@ -3,7 +3,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
+use scanhub_schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
 
 /// What makes a mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

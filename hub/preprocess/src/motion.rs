@@ -15,7 +15,7 @@ mod view;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
+use scanhub_schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
 
 use crate::lines::{self, LineFinder};
 use crate::velocity::{Velocity, times};

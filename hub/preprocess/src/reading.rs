@@ -1,7 +1,7 @@
 //! The meaning of one beam's value, written as the design states it. Tests compare the background's faster code for
 //! whole scans with it.
 
-use schema::{Code, Scan};
+use scanhub_schema::{Code, Scan};
 
 /// The reading of one beam.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,7 +30,7 @@ impl Reading {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::ScanHead;
+    use scanhub_schema::ScanHead;
 
     #[test]
     fn codes_and_ranges() {

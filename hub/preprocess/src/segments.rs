@@ -5,7 +5,7 @@
 use std::f64::consts::{PI, TAU};
 use std::mem::{replace, take};
 
-use schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
+use scanhub_schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
 
 /// Cuts the foreground of one sensor into segments.
 ///

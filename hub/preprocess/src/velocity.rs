@@ -1,6 +1,6 @@
 //! Velocity of a robot that moves while a scan is measured.
 
-use schema::{Pose, Scan};
+use scanhub_schema::{Pose, Scan};
 
 /// Velocity of a robot or of a sensor, in its own frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

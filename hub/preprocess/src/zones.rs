@@ -7,7 +7,7 @@
 
 use std::f64::consts::TAU;
 
-use schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
+use scanhub_schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
 
 /// Sector of the sensor's view in which parts of the robot itself are visible.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

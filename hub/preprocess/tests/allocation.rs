@@ -8,11 +8,11 @@ use std::hint::black_box;
 use std::sync::atomic::Ordering::Relaxed;
 
 use counting::{TAKEN, WATCHED};
-use preprocess::background::{self, Method, Model};
-use preprocess::segments::Segmenter;
-use preprocess::{lines, marks, motion, zones};
 use rustix::thread::gettid;
-use schema::{Background, Foreground, Lines, Marks, Motion, Pose, Scan, Zones};
+use scanhub_preprocess::background::{self, Method, Model};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_preprocess::{lines, marks, motion, zones};
+use scanhub_schema::{Background, Foreground, Lines, Marks, Motion, Pose, Scan, Zones};
 use surroundings::{BEAMS, Shape, Surroundings};
 
 #[test]

@@ -2,8 +2,8 @@
 //! in the beams that have not arrived.
 
 use fastrand::Rng;
-use preprocess::zones::{Check, Settings, Warning};
-use schema::{Pose, Scan, ScanHead, Verdict, Zones};
+use scanhub_preprocess::zones::{Check, Settings, Warning};
+use scanhub_schema::{Pose, Scan, ScanHead, Verdict, Zones};
 
 const BEAMS: usize = 100;
 const FAR: u16 = 5000;
@@ -88,10 +88,10 @@ fn scans_of_another_form_warn_of_nothing() {
 fn turns_of_which_none_takes_as_long_as_another_are_counted_in_a_row() {
     let settings = Settings { min_scans: 2, ..Settings::default() };
     let mut check = Check::new(Pose::default(), &settings, BEAMS);
-    let mut turn = Scan::zeroed(Scan::len(BEAMS, schema::Contents::TURNING));
+    let mut turn = Scan::zeroed(Scan::len(BEAMS, scanhub_schema::Contents::TURNING));
     let mut verdicts = Vec::new();
     for number in 0..3 {
-        let head = ScanHead::turning(schema::Family::Ld, BEAMS);
+        let head = ScanHead::turning(scanhub_schema::Family::Ld, BEAMS);
         let arrays = turn.begin(ScanHead { spacing: head.spacing + number as f32 * 5e-6, ..head });
         arrays.ranges.fill(500);
         arrays.upper.fill(0);

@@ -3,8 +3,8 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use fastrand::Rng;
-use preprocess::lines::{LineFinder, Settings, Stop};
-use schema::{Code, Contents, Line, Lines, Pose, Scan, ScanHead};
+use scanhub_preprocess::lines::{LineFinder, Settings, Stop};
+use scanhub_schema::{Code, Contents, Line, Lines, Pose, Scan, ScanHead};
 
 fn head(count: usize, first_angle: f64, step: f64) -> ScanHead {
     let no_return = Code::NoReturn.value();
@@ -279,8 +279,8 @@ fn keys_are_kept_to() {
 
 fn is_sound(lines: &Lines, scan: &Scan, settings: &Settings) {
     let payload = &mut [0; 4096];
-    let len = schema::datagram::Packed::pack(lines, payload).unwrap();
-    assert!(<Lines as schema::datagram::Packed>::room(&payload[..len]).is_some(), "{lines:?}");
+    let len = scanhub_schema::datagram::Packed::pack(lines, payload).unwrap();
+    assert!(<Lines as scanhub_schema::datagram::Packed>::room(&payload[..len]).is_some(), "{lines:?}");
     assert!(lines.count <= settings.max && usize::from(lines.readings) <= scan.beams());
     assert_eq!(lines.lines().iter().map(|line| line.points).sum::<u16>(), lines.on_lines);
     assert!(lines.lines().windows(2).all(|pair| pair[0].last < pair[1].first));

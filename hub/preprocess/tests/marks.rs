@@ -3,8 +3,8 @@
 mod scans;
 
 use fastrand::Rng;
-use preprocess::marks::{MarkDetector, Settings};
-use schema::{Family, MARKS, Mark, Marks, Scan, ScanHead};
+use scanhub_preprocess::marks::{MarkDetector, Settings};
+use scanhub_schema::{Family, MARKS, Mark, Marks, Scan, ScanHead};
 
 /// A beam that belongs to a mark: its index, range in mm and intensity.
 #[derive(Clone, Copy)]

@@ -1,8 +1,8 @@
 //! What a model is made for, what is done to it by command, and what it does with scans that no sensor sends.
 
-use preprocess::background::{Class, Method, Mismatch, Model, Settings, Start};
-use preprocess::segments::Segmenter;
-use schema::{Background, BackgroundHead, Foreground, Pose, Scan, ScanHead};
+use scanhub_preprocess::background::{Class, Method, Mismatch, Model, Settings, Start};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Background, BackgroundHead, Foreground, Pose, Scan, ScanHead};
 
 /// The most beams of a scan.
 const BEAMS: usize = 401;

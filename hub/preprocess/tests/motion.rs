@@ -7,8 +7,8 @@ use std::f64::consts::PI;
 
 use drives::{Drive, beams_at, normal, scan};
 use fastrand::Rng;
-use preprocess::motion::{MotionEstimator, Rigid, Settings};
-use schema::{Contents, Motion, MotionMethod, Pose, Scan};
+use scanhub_preprocess::motion::{MotionEstimator, Rigid, Settings};
+use scanhub_schema::{Contents, Motion, MotionMethod, Pose, Scan};
 
 /// What is said of each of `scans`; what was in the payload before does not stay.
 fn follow(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
@@ -435,7 +435,8 @@ fn any_scan_is_answered_with_numbers() {
                 let count = random.usize(..300);
                 let contents = if random.bool() { Contents::ANGLES } else { 0 };
                 let step = [0.0, 0.01, -0.02, 0.3, f64::MIN_POSITIVE][random.usize(..5)];
-                let head = schema::ScanHead { contents, ..beams_at(count, 3.0 * random.f64() - 1.5, step) };
+                let head =
+                    scanhub_schema::ScanHead { contents, ..beams_at(count, 3.0 * random.f64() - 1.5, step) };
                 let wild: Vec<u16> = (0..count).map(|_| random.u16(..)).collect();
                 let mut scan = Scan::of(head, &wild);
                 scan.unit_um = [0, 1, 1000, u32::MAX][random.usize(..4)];

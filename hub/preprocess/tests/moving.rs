@@ -7,18 +7,18 @@ use std::collections::{HashMap, HashSet};
 
 use drives::Drive;
 use fastrand::Rng;
-use preprocess::background::{Class, Method, Model, Settings};
-use preprocess::motion::{self, MotionEstimator, Rigid};
-use preprocess::velocity::Velocity;
-use schema::{Background, Foreground, Motion, MotionMethod, Pose, Scan};
+use scanhub_preprocess::background::{Class, Method, Model, Settings};
+use scanhub_preprocess::motion::{self, MotionEstimator, Rigid};
+use scanhub_preprocess::velocity::Velocity;
+use scanhub_schema::{Background, Foreground, Motion, MotionMethod, Pose, Scan};
 
 const SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
     candidate_mm: None,
     scans: Some(100),
-    candidate: preprocess::background::Candidate::First,
-    start: preprocess::background::Start::Empty,
+    candidate: scanhub_preprocess::background::Candidate::First,
+    start: scanhub_preprocess::background::Start::Empty,
     no_return_is_far: None,
 };
 

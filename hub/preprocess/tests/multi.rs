@@ -3,8 +3,8 @@
 
 mod surroundings;
 
-use preprocess::background::{Class, Method, Model, Settings, Start};
-use schema::{Background, Scan};
+use scanhub_preprocess::background::{Class, Method, Model, Settings, Start};
+use scanhub_schema::{Background, Scan};
 use surroundings::{
     BEAMS, Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
     unit_mm,

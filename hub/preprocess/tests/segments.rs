@@ -1,7 +1,7 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
-use preprocess::segments::Segmenter;
-use schema::{Contents, Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Contents, Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
 
 /// Beams of every scan here.
 const BEAMS: usize = 401;

@@ -5,16 +5,16 @@
 mod decoded_scan;
 
 use fastrand::Rng;
-use preprocess::background::{Model, Settings as BackgroundSettings};
-use preprocess::lines::{LineFinder, Settings as LineSettings};
-use preprocess::marks::{MarkDetector, Settings as MarkSettings};
-use preprocess::segments::Segmenter;
 use scanhub_drivers::lms::variant::{Unit, Variant};
-use schema::{Foreground, Lines, Marks, Pose, Scan};
-use sim::beam::NoiseModel;
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_preprocess::background::{Model, Settings as BackgroundSettings};
+use scanhub_preprocess::lines::{LineFinder, Settings as LineSettings};
+use scanhub_preprocess::marks::{MarkDetector, Settings as MarkSettings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Lines, Marks, Pose, Scan};
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 const SCAN_NS: u64 = 26_640_000;
 

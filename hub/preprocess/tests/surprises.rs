@@ -5,10 +5,10 @@ mod drives;
 
 use drives::Drive;
 use fastrand::Rng;
-use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
-use preprocess::lines::{self, LineFinder};
-use preprocess::motion::{self, MotionEstimator, Rigid};
-use schema::{Foreground, Lines, Motion, MotionMethod, Pose, Scan};
+use scanhub_preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
+use scanhub_preprocess::lines::{self, LineFinder};
+use scanhub_preprocess::motion::{self, MotionEstimator, Rigid};
+use scanhub_schema::{Foreground, Lines, Motion, MotionMethod, Pose, Scan};
 
 const MAP: Settings = Settings {
     method: Method::Moving,

@@ -1,7 +1,7 @@
 //! Tests of verdicts, circles and what a beam tells.
 
-use preprocess::zones::{Check, Sector, Settings};
-use schema::{Code, Contents, Pose, Scan, ScanHead, Verdict, Zones};
+use scanhub_preprocess::zones::{Check, Sector, Settings};
+use scanhub_schema::{Code, Contents, Pose, Scan, ScanHead, Verdict, Zones};
 
 const INVALID: u16 = 0x1FFF - 5;
 

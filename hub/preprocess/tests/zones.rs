@@ -5,8 +5,8 @@
 mod scans;
 
 use fastrand::Rng;
-use preprocess::zones::{Check, Sector, Settings};
-use schema::{Pose, Scan, ScanHead, Verdict, Zones};
+use scanhub_preprocess::zones::{Check, Sector, Settings};
+use scanhub_schema::{Pose, Scan, ScanHead, Verdict, Zones};
 
 /// One random configuration.
 struct Case {

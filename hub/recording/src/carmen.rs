@@ -18,7 +18,7 @@ use scanhub_drivers::lms::reply::{self, Reply};
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::open::{is_end, unreadable};
 use crate::{Contents, Encoding, Form, Frame};

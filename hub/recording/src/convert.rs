@@ -13,9 +13,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use flate2::write::GzEncoder;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_files::output::{OutputFile, unwritable};
-use schema::csv::{MarkColumns, ScanColumns};
-use schema::file::Compression;
-use schema::{Failure, Family, Kind, Topic, check_followed};
+use scanhub_schema::csv::{MarkColumns, ScanColumns};
+use scanhub_schema::file::Compression;
+use scanhub_schema::{Failure, Family, Kind, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread};
 use writers::{Csv, Ros2};

@@ -19,7 +19,7 @@ use scanhub_drivers::lms::measured::{MEASURED, Measured, nominal_period};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::{Family, Nanos};
+use scanhub_schema::{Family, Nanos};
 
 pub use carmen::{BEYOND, Unfit, Unread};
 pub use open::Recording;
@@ -40,16 +40,16 @@ pub struct Frame {
     /// Reasons why it is suspect, bits of [`scanhub_drivers::line::suspect`].
     pub reasons: u8,
     /// Header that the hub published. Streams and logs have none.
-    pub header: Option<schema::Header>,
+    pub header: Option<scanhub_schema::Header>,
 }
 
 /// Record of a file that matters for the angles of a mount.
 #[derive(Clone, Copy, Debug)]
 pub enum MountRecord {
     /// Angle of the mount.
-    Angle(schema::Header, schema::Tilt),
+    Angle(scanhub_schema::Header, scanhub_schema::Tilt),
     /// Header of a telegram from a sensor of the mount's machine. Its stamps are from the same clock as the mount's.
-    Telegram(schema::Header),
+    Telegram(scanhub_schema::Header),
 }
 
 impl Frame {

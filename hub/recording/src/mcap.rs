@@ -10,9 +10,9 @@ use mcap::records::{Channel, MessageHeader, Record as Parsed, op};
 use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
-use schema::datagram::Packed;
-use schema::file::{self, ENCODING, ENCODING_V1, METADATA};
-use schema::{Family, Foreground, Header, Maker, Pace, Scan, Status, Tilt, Topic, check_followed};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{self, ENCODING, ENCODING_V1, METADATA};
+use scanhub_schema::{Family, Foreground, Header, Maker, Pace, Scan, Status, Tilt, Topic, check_followed};
 
 use crate::{Contents, Damage, Frame, MountRecord};
 use records::Records;

@@ -9,7 +9,7 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of};
 use scanhub_drivers::{Model, Session, Settings, features};
 use scanhub_files::regular;
-use schema::{Failure, Family, Kind};
+use scanhub_schema::{Failure, Family, Kind};
 
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]

@@ -8,7 +8,7 @@ use scanhub_drivers::line::{Event, Output, Protocol, Session as _};
 use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
 use scanhub_drivers::recognize::framing_mode;
 use scanhub_drivers::{Session, Settings, features};
-use schema::{Failure, Family, MILLIS, Nanos, line_time};
+use scanhub_schema::{Failure, Family, MILLIS, Nanos, line_time};
 
 use crate::open::{is_end, reader, unreadable};
 use crate::{Contents, Form, Frame};
@@ -145,7 +145,7 @@ impl Packets {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
+/// Returns [`Kind::Input`](scanhub_schema::Kind::Input) if it cannot be read.
 pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Contents, Failure> {
     let mut stream = StreamReader::new(family, head, reader(path)?);
     let mut contents = Contents { form: Form::Telegrams, family: family as u8, ..Contents::default() };

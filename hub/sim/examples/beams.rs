@@ -5,15 +5,15 @@
 use scanhub_drivers::line::grid::{Grid, Point};
 use scanhub_drivers::line::{Event, Output, Session};
 use scanhub_drivers::{Settings, ld, rplidar};
-use schema::{MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::Device;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::port::now_ns;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::port::now_ns;
 
-use sim::room::Room;
-use sim::rplidar::{RplidarSettings, RplidarSimulator};
-use sim::world::World;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{RplidarSettings, RplidarSimulator};
+use scanhub_sim::world::World;
 
 fn room() -> Room {
     let world: World = "room".parse().expect("a built-in world");
@@ -110,7 +110,7 @@ fn main() {
         let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
         rows(model.name(), a_turn as usize, &turns(session, head, 30).0, &percents);
     }
-    for simulated in sim::rplidar::Model::ALL {
+    for simulated in scanhub_sim::rplidar::Model::ALL {
         for mode in simulated.modes() {
             let settings = Settings {
                 model: Some(simulated.name()),

@@ -9,9 +9,9 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use sim::beam::NoiseModel;
-use sim::room::BeamTarget;
-use sim::room::Room;
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
 
 /// An edge in a scan.
 struct Edge {
@@ -93,7 +93,7 @@ struct World {
 }
 
 impl World {
-    fn measure(world: &sim::world::World) -> World {
+    fn measure(world: &scanhub_sim::world::World) -> World {
         let mut found = World::default();
         let layers = NoiseModel { spot: false, ..world.noise().unwrap_or_default() };
         let without_width = world.clone().with_noise(layers);
@@ -134,8 +134,8 @@ fn main() {
     );
     println!("|---|---|---|---|---|---|---|---|");
     for name in names {
-        let world: Result<sim::world::World, _> = match &*name {
-            "board" => sim::world::World::of_toml(&name, BOARD),
+        let world: Result<scanhub_sim::world::World, _> = match &*name {
+            "board" => scanhub_sim::world::World::of_toml(&name, BOARD),
             _ => name.parse(),
         };
         let world = world.unwrap_or_else(|failure| panic!("{failure}"));

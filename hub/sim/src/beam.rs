@@ -8,7 +8,7 @@
 //! beyond the maximum is sent as a code.
 
 use scanhub_drivers::lms;
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::room::BeamTarget;
 use crate::scene::Surface;

@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 
 use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
-use schema::{Nanos, line_time};
+use scanhub_schema::{Nanos, line_time};
 
 use crate::request_decoder::{Arrival, Dropped};
 
@@ -279,7 +279,7 @@ impl TxQueue {
 
 #[cfg(test)]
 mod tests {
-    use schema::MICROS;
+    use scanhub_schema::MICROS;
 
     use super::*;
 

@@ -15,7 +15,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use scanhub_drivers::lms;
-use schema::{Failure, Kind, MILLIS, Nanos};
+use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
 
 use crate::machine::ProtocolQuirks;
 

@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
-use recording::{Encoding, Recording};
 pub use scanhub_drivers::ld::Model;
 use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Failure, Family, Kind, MILLIS, Nanos};
+use scanhub_recording::{Encoding, Recording};
+use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 use crate::device::ChunkSize;
 use crate::device::TxQueue;

@@ -10,7 +10,6 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
-use lms_configure::eeprom::{self, PowerOn, Write};
 use scanhub_drivers::lms::command::{self, EEPROM_WRITES, Request};
 use scanhub_drivers::lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
 use scanhub_drivers::lms::family::Family;
@@ -19,7 +18,8 @@ use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::reply::{self, Health};
 use scanhub_drivers::lms::telegram::{ACK, Encoded, NAK, REPLY, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
-use schema::{MILLIS, Nanos};
+use scanhub_lms_configure::eeprom::{self, PowerOn, Write};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device, Part, Sent};
 use crate::device::{ChunkSize, Transmission};

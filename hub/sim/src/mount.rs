@@ -4,7 +4,7 @@
 use std::cmp::Reverse;
 use std::f64::consts::PI;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::shape::Plane;
 use crate::shape::Point;

@@ -7,7 +7,7 @@ use scanhub_drivers::lms::measured::{Frame, encode_with};
 use scanhub_drivers::lms::operating::{self as mode, Operating as Asked};
 use scanhub_drivers::lms::telegram::{REPLY, Writer};
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::{Nanos, line_time};
+use scanhub_schema::{Nanos, line_time};
 
 use crate::room::Room;
 
@@ -206,7 +206,7 @@ impl MeasuredValues<'_> {
             let at_ns = self.at_ns + scan_number * scan;
             let words = self.room.scan(self.variant, self.unit, self.mode, at_ns);
             for (sum, range) in sums.iter_mut().zip(words.iter().map(|word| word & greatest)) {
-                if range < greatest - recording::BEYOND {
+                if range < greatest - scanhub_recording::BEYOND {
                     *sum = (sum.0 + u32::from(range), sum.1 + 1);
                 }
             }
@@ -223,7 +223,9 @@ impl MeasuredValues<'_> {
         let levels = Mode(1);
         let words = self.room.scan(self.variant, self.unit, levels, self.at_ns);
         let pair = |word: u16| match word & levels.max_value() {
-            range if range < levels.max_value() - recording::BEYOND => [range, 400 + 2_000 * (word >> 13)],
+            range if range < levels.max_value() - scanhub_recording::BEYOND => {
+                [range, 400 + 2_000 * (word >> 13)]
+            }
             code => [code, 0],
         };
         words.into_iter().map(pair).collect()

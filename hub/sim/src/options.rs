@@ -7,7 +7,7 @@ use std::time::Duration;
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::device::ChunkSize;
 use crate::fault::Faults;

@@ -24,7 +24,7 @@ use rustix::io::{self, Errno};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr};
 use rustix::time::{ClockId, clock_gettime};
-use schema::{Failure, Kind, Nanos};
+use scanhub_schema::{Failure, Kind, Nanos};
 
 /// The host's end of a line.
 pub(crate) enum SimPort {

@@ -5,7 +5,7 @@
 use std::fmt;
 
 use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX};
-use schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
 /// Time at which the host wrote a byte, as far as it is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

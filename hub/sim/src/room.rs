@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::{Nanos, Scan, ScanHead};
+use scanhub_schema::{Nanos, Scan, ScanHead};
 
 use crate::beam::{self, BeamRng};
 use crate::beam::{Echo, echo};
@@ -241,12 +241,16 @@ pub(crate) fn reported_range(world: &WorldView, echo: &Echo, sun: f64, rng: &Bea
 
 /// Returns the truth for a beam that hit `target` and reported `word`.
 fn truth(word: u16, target: BeamTarget, mode: Mode) -> BeamTarget {
-    if word & mode.max_value() >= mode.max_value() - recording::BEYOND { BeamTarget::Invalid } else { target }
+    if word & mode.max_value() >= mode.max_value() - scanhub_recording::BEYOND {
+        BeamTarget::Invalid
+    } else {
+        target
+    }
 }
 
 /// Returns the range value of `units` (any number), or the code for a range beyond the maximum.
 fn range_value(units: f64, mode: Mode) -> u16 {
-    let beyond = mode.max_value() - recording::BEYOND;
+    let beyond = mode.max_value() - scanhub_recording::BEYOND;
     (units.round().max(0.0) as u16).min(beyond)
 }
 

@@ -3,7 +3,7 @@
 
 use std::f64::consts::TAU;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::beam::echo;
 use crate::beam::{BeamRng, NoiseModel};

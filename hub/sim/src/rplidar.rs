@@ -11,7 +11,7 @@
 
 mod protocol;
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
 use crate::device::{ChunkSize, TxQueue};

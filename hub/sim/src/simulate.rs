@@ -10,11 +10,11 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
 use scanhub_files::output::{self, Target};
-use schema::{Failure, Family, Kind, MILLIS, Nanos};
+use scanhub_recording::{Encoding, Frame, Recording};
+use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 

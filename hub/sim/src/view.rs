@@ -4,7 +4,7 @@
 use std::ops::Range;
 use std::sync::LazyLock;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::beam::NoiseModel;
 use crate::mount::Mount;

@@ -9,7 +9,7 @@
 
 use std::collections::VecDeque;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::device::{Chunk, Device, Part, Sent};
 use crate::fault::{ByteOutcome, Delay, Extra, Fault, Faults, Noise, Schedule, TelegramFaults, Window};

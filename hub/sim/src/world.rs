@@ -9,7 +9,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 use scanhub_files::regular;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
 
 use crate::doctor::Finding;

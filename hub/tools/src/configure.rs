@@ -8,9 +8,6 @@ use std::fmt;
 use std::io::{IsTerminal, Write, stderr, stdin};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use lms_configure::eeprom::PowerOn;
-use lms_configure::{Change, Consent, Failing, Outcome, OwnedConfiguration, Plan, Step};
-use port::{Source, clock};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
 use scanhub_drivers::Inquiry;
@@ -20,9 +17,12 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Failure, Kind};
+use scanhub_lms_configure::eeprom::PowerOn;
+use scanhub_lms_configure::{Change, Consent, Failing, Outcome, OwnedConfiguration, Plan, Step};
+use scanhub_port::{Source, clock};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::driver::{Procedure, drive};
 use crate::probe::{check_unused, hex, measuring, open, request_report};

@@ -15,15 +15,15 @@ use std::fmt;
 use std::sync::atomic::AtomicBool;
 
 pub use crate::bridge_program::Bridge;
-use config::{Config, Gateway, Link};
 pub(crate) use hub::Hub;
 pub use installation::System;
 use machine::Facts;
-use port::{Candidate, PortlessAdapter, Source, candidates};
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, Printable};
+use scanhub_config::{Config, Gateway, Link};
+use scanhub_port::{Candidate, PortlessAdapter, Source, candidates};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, Printable};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
@@ -199,7 +199,7 @@ pub fn run_checks(
         tell(&finding);
     };
     let there = candidates();
-    let home = targets.places.iter().find(|place| matches!(shm::holder(place.root()), Ok(Some(_))));
+    let home = targets.places.iter().find(|place| matches!(scanhub_shm::holder(place.root()), Ok(Some(_))));
     let domain = home.unwrap_or(&targets.domain);
     let hub = Hub::find(domain);
     let portless = PortlessAdapter::all(&targets.system.path("/"));
@@ -222,10 +222,10 @@ pub fn run_checks(
     };
     let facts = Facts::gather(domain, &targets.places, limits, hub.as_ref());
     let config = targets.config.as_ref().and_then(|config| config.as_ref().ok());
-    tell(machine::memory(&facts, config.and_then(config::Config::memory_remedy)));
+    tell(machine::memory(&facts, config.and_then(scanhub_config::Config::memory_remedy)));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
-    tell(shared_memory::strangers(&shm::strangers(domain.root()), |user| system.name_of(user)));
+    tell(shared_memory::strangers(&scanhub_shm::strangers(domain.root()), |user| system.name_of(user)));
     tell(shared_memory::leftovers(&facts));
     tell(machine::descriptors(&facts));
     tell(machine::file_size(&facts));

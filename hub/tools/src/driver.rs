@@ -7,14 +7,14 @@ use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_drivers::line::{
     Account, Condition, Event, Introduction, Output, Protocol, Session as _, Values,
 };
 use scanhub_drivers::search::{Coverage, Found, PortKind, Search};
 use scanhub_drivers::{Model, Session, Settings, features};
-use schema::{Failure, Family, Kind, MILLIS, Nanos};
+use scanhub_port::{Port, clock};
+use scanhub_schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 /// A rotating scanner that was detected, and what was received from it.
 #[derive(Clone, Debug)]

@@ -8,14 +8,14 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use port::{
-    Candidate, Port, PortError, PortlessAdapter, Source, all_holders, candidates, check_tty, clock, found_in,
-};
 use scanhub_drivers::search::{self, Coverage};
 use scanhub_drivers::{Inquiry, Report, features, inquiry};
-use schema::{Failure, Family, Kind};
+use scanhub_port::{
+    Candidate, Port, PortError, PortlessAdapter, Source, all_holders, candidates, check_tty, clock, found_in,
+};
+use scanhub_schema::{Failure, Family, Kind};
+use scanhub_shm::Domain;
 use serde::Serialize;
-use shm::Domain;
 
 use crate::doctor::Hub;
 use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
@@ -206,7 +206,7 @@ fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: 
 
 /// Returns the remedy for a port at which no scanner of the named family replies.
 fn other_scanner(source: &Source) -> String {
-    format!("is it another scanner? Try: scanhub probe {}", shm::shell_word(&source.name()))
+    format!("is it another scanner? Try: scanhub probe {}", scanhub_shm::shell_word(&source.name()))
 }
 
 /// Lists `rates`, as in "9600, 19200 or 38400".
@@ -366,7 +366,7 @@ impl SuggestedLink {
 
     /// Returns the command that runs a hub for this scanner, as a shell takes it.
     pub fn command(&self) -> String {
-        format!("scanhub run --link {}", shm::shell_word(&self.flag()))
+        format!("scanhub run --link {}", scanhub_shm::shell_word(&self.flag()))
     }
 
     /// Returns the section of a configuration file, without the end of its last line.
@@ -426,7 +426,7 @@ const NAME: &str = "front";
 
 #[cfg(test)]
 mod tests {
-    use config::{Config, Link, Sources};
+    use scanhub_config::{Config, Link, Sources};
     use scanhub_drivers::lms::family::Family as Type;
 
     use super::*;

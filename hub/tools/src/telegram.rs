@@ -11,14 +11,14 @@ use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
-use recording::{Encoding, Form, Frame, Recording};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::explain::{Field, Headline, Value, explain};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{REPLY, Telegram};
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_files::regular;
-use schema::{Failure, Family, Kind, Printable};
+use scanhub_recording::{Encoding, Form, Frame, Recording};
+use scanhub_schema::{Failure, Family, Kind, Printable};
 use serde::Serialize;
 
 use parser::{Item, StreamParser};
@@ -435,7 +435,7 @@ impl<'o> ItemPrinter<'o> {
                     explain(telegram, self.mode, &mut |field| line.fields.push(json(field)));
                 }
                 line.raw = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-                schema::json_line(serde_json::to_string(&line)?)
+                scanhub_schema::json_line(serde_json::to_string(&line)?)
             }
             OutputForm::Text { all } => {
                 let mut text = format!("{offset:>8}  {:4} bytes  {}", line.length, line.words);

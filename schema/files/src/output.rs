@@ -21,7 +21,7 @@ use rustix::io::Errno;
 use tempfile::NamedTempFile;
 
 use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, named, user};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// Writes all of `content` to the file at `path`; replaces an existing one if `force`.
 ///

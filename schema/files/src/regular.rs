@@ -8,7 +8,7 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
 /// long.

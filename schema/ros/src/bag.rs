@@ -3,8 +3,8 @@
 
 use std::io::{self, Write};
 
-use schema::file::{Foreign, Writer};
-use schema::{Header, Pose, Scan};
+use scanhub_schema::file::{Foreign, Writer};
+use scanhub_schema::{Header, Pose, Scan};
 
 use crate::{
     LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, points_topic, scan_cloud,

@@ -1,6 +1,6 @@
 //! A scan as `sensor_msgs/msg/LaserScan`. Refuses to know where the sensor sits.
 
-use schema::{Code, Header, Scan};
+use scanhub_schema::{Code, Header, Scan};
 
 use crate::cdr::Cdr;
 
@@ -77,7 +77,7 @@ fn metres(range: u16, scan: &Scan) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{Family, ScanHead};
+    use scanhub_schema::{Family, ScanHead};
 
     fn scan(ranges: &[u16], step_mdeg: u32) -> Box<Scan> {
         Scan::of(ScanHead::lms(ranges.len(), -90_000, step_mdeg, 10, 13), ranges)

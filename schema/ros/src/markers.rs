@@ -1,6 +1,6 @@
 //! Circles, reflectors and people as `visualization_msgs/msg/MarkerArray`. Refuses to know how they are found.
 
-use schema::{Header, Marks, TrackState, Tracks, Verdict, Zones};
+use scanhub_schema::{Header, Marks, TrackState, Tracks, Verdict, Zones};
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
@@ -162,7 +162,7 @@ const YELLOW: [f32; 4] = [1.0, 0.8, 0.0, 1.0];
 
 #[cfg(test)]
 mod tests {
-    use schema::{Mark, Track, Zone};
+    use scanhub_schema::{Mark, Track, Zone};
 
     use super::*;
     use crate::{MARKER_ARRAY, Value, read};

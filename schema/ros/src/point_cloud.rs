@@ -2,7 +2,7 @@
 
 use std::mem::offset_of;
 
-use schema::{CloudPoint, Foreground, Header, Scan};
+use scanhub_schema::{CloudPoint, Foreground, Header, Scan};
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
@@ -112,7 +112,7 @@ const UINT8: u8 = 2;
 
 #[cfg(test)]
 mod tests {
-    use schema::{ForegroundHead, ScanHead};
+    use scanhub_schema::{ForegroundHead, ScanHead};
 
     use super::*;
     use crate::{POINT_CLOUD, read};

@@ -1,6 +1,6 @@
 //! Where people are and whither they walk, as `geometry_msgs/msg/PoseArray`. Refuses to know how they are drawn.
 
-use schema::{Header, TrackState, Tracks};
+use scanhub_schema::{Header, TrackState, Tracks};
 
 use crate::cdr::Cdr;
 
@@ -24,7 +24,7 @@ const WALKS_M_S: f64 = 0.2;
 
 #[cfg(test)]
 mod tests {
-    use schema::Track;
+    use scanhub_schema::Track;
 
     use super::*;
     use crate::{POSE_ARRAY, Value, read};

@@ -1,7 +1,7 @@
 //! How a sensor is, for programs and for people: `std_msgs/msg/String` and `diagnostic_msgs/msg/DiagnosticArray`. Refuses
 //! to know where a status comes from.
 
-use schema::{State, Status, Verdict};
+use scanhub_schema::{State, Status, Verdict};
 
 use crate::cdr::Cdr;
 
@@ -93,7 +93,7 @@ const STALE: u8 = 3;
 
 #[cfg(test)]
 mod tests {
-    use schema::Counter;
+    use scanhub_schema::Counter;
 
     use super::*;
     use crate::{DIAGNOSTIC_ARRAY, STRING, Value, read};

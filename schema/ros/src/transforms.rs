@@ -1,6 +1,6 @@
 //! The poses of sensors, as `tf2_msgs/msg/TFMessage`. Refuses to know scans.
 
-use schema::Pose;
+use scanhub_schema::Pose;
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;

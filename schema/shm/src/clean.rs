@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use nix::libc::{self, c_int};
 use rustix::fs::{FileType, OFlags};
-use schema::Failure;
+use scanhub_schema::Failure;
 
 use crate::directory::Directory;
 use crate::domain::Domain;
@@ -33,8 +33,8 @@ pub struct Cleaned {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::DomainHeld`](schema::Kind) if a hub or a listener publishes there, because it cleans up by itself.
-/// Returns [`Kind::Failed`](schema::Kind) if the directory belongs to another user.
+/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by itself.
+/// Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();
     let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };

@@ -9,7 +9,7 @@ use iceoryx2::prelude::{AllocationStrategy, EventId, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
-use schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
+use scanhub_schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
 
 use crate::node::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};

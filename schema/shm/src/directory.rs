@@ -17,7 +17,7 @@ use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat, fstat, openat, rena
 use rustix::io::Errno;
 
 use scanhub_files::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::shortage;
 

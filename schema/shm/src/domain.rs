@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";

@@ -22,7 +22,7 @@ use rustix::io::Errno;
 use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
 use rustix::time::{ClockId, Timespec};
 
-use schema::{Failure, Kind, Ring};
+use scanhub_schema::{Failure, Kind, Ring};
 
 use crate::node::Node;
 use crate::segments::{Segment, in_the_way};

@@ -10,7 +10,7 @@ use std::path::Path;
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::directory::Directory;
 use crate::shortage;

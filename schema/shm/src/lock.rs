@@ -6,7 +6,7 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::domain::{Domain, Environment};
 use crate::file_lock::{FileLock, MakingLock, content, held_file, pid_in};

@@ -11,7 +11,7 @@ use iceoryx2::prelude::{
     CallbackProgression, FileName, LogLevel, NodeBuilder, SemanticString, SignalHandlingMode,
     set_log_level_from_env_or,
 };
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::directory::Directory;
 use crate::domain::Domain;

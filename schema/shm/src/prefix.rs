@@ -8,7 +8,7 @@ use std::hash::{BuildHasher, RandomState};
 use std::io::Read;
 use std::path::Path;
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::directory::Directory;
 use crate::file_lock::MakingLock;

@@ -3,7 +3,7 @@
 use iceoryx2::prelude::CallbackProgression;
 use iceoryx2::prelude::ipc::Service;
 use iceoryx2::service::Service as _;
-use schema::{Failure, Maker, Topic, of_service};
+use scanhub_schema::{Failure, Maker, Topic, of_service};
 
 use crate::domain::Domain;
 use crate::node::config;
@@ -14,7 +14,7 @@ use crate::segments::access_failure;
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`](schema::Kind) with owner, mode and remedy if the directory belongs to another user.
+/// Returns [`Kind::Failed`](scanhub_schema::Kind) with owner, mode and remedy if the directory belongs to another user.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     let mut sensors: Vec<String> = published(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
     sensors.dedup();

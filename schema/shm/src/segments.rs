@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use rustix::fs::{CWD, FallocateFlags, OFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
 use scanhub_files::path_walk::named;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::directory::Directory;
 use crate::domain::Domain;

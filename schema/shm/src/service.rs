@@ -14,8 +14,8 @@ use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateErr
 use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
-use schema::limits::TopicLimits;
-use schema::{Failure, Kind, is_remote, of_service};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Kind, is_remote, of_service};
 
 use crate::file_lock::MakingLock;
 use crate::node::Node;

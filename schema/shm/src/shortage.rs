@@ -12,8 +12,8 @@ use rustix::fs::{StatVfs, statvfs};
 use rustix::io::Errno;
 use rustix::param::page_size;
 use rustix::process::{Resource, getrlimit, setrlimit};
-use schema::limits::TopicLimits;
-use schema::{Failure, Header, Kind, Topic, limits};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Header, Kind, Topic, limits};
 
 /// Directory of POSIX shared memory on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";

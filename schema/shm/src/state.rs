@@ -8,7 +8,7 @@ use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::directory::Directory;
 use crate::domain::first_path;

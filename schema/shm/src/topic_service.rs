@@ -16,8 +16,8 @@ use iceoryx2::service::builder::publish_subscribe::{
 };
 use iceoryx2::service::port_factory::publish_subscribe;
 
-use schema::limits::TopicLimits;
-use schema::{Failure, Header, Kind, Topic, limits};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Header, Kind, Topic, limits};
 
 use crate::node::Node;
 use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher, open};
@@ -218,19 +218,19 @@ macro_rules! payloads {
     (Cloud, $topic:ident) => { payloads!(Cloud, CloudWord, $topic); };
     ($payload:ident, $word:ident, $topic:ident) => {
         payload!(
-            schema::$payload, Topic::$topic, [schema::$word], len,
-            Box<schema::$payload>, schema::$payload::zeroed(len),
+            scanhub_schema::$payload, Topic::$topic, [scanhub_schema::$word], len,
+            Box<scanhub_schema::$payload>, scanhub_schema::$payload::zeroed(len),
             |builder, limits| {
                 let longest = Topic::$topic.longest(limits);
-                builder.initial_max_slice_len(schema::$payload::words(longest))
+                builder.initial_max_slice_len(scanhub_schema::$payload::words(longest))
             },
-            |publisher| publisher.loan_slice(schema::$payload::words(len)),
-            schema::$payload::of_words, schema::$payload::of_words_mut, schema::$payload::bytes
+            |publisher| publisher.loan_slice(scanhub_schema::$payload::words(len)),
+            scanhub_schema::$payload::of_words, scanhub_schema::$payload::of_words_mut, scanhub_schema::$payload::bytes
         );
     };
     ($payload:tt, $topic:ident) => {
         payload!(
-            schema::$payload, Topic::$topic, schema::$payload, _len, Box<schema::$payload>, Box::default(),
+            scanhub_schema::$payload, Topic::$topic, scanhub_schema::$payload, _len, Box<scanhub_schema::$payload>, Box::default(),
             |builder, _limits| builder,
             |publisher| publisher.loan(),
             std::convert::identity, std::convert::identity, bytemuck::bytes_of
@@ -238,7 +238,7 @@ macro_rules! payloads {
     };
 }
 
-schema::for_each_topic!(payloads);
+scanhub_schema::for_each_topic!(payloads);
 
 /// Returns the number of places for subscribers that `topic` was created with.
 pub fn places<P: Payload + ?Sized>(topic: &TopicService<P>) -> usize {
@@ -409,7 +409,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     /// # Errors
     ///
     /// Returns the library's error if there is no memory, or if bytes are longer than
-    /// [`Telegram::MAX`](schema::Telegram::MAX).
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
     pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
         self.medium.loan(len)
     }
@@ -471,7 +471,7 @@ impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than
-    /// [`Telegram::MAX`](schema::Telegram::MAX).
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
     }

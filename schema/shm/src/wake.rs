@@ -16,7 +16,7 @@ use iceoryx2::service::port_factory::event;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use schema::{Failure, Kind, Ring, Topic, Wake, limits};
+use scanhub_schema::{Failure, Kind, Ring, Topic, Wake, limits};
 
 use crate::doorbell::DoorbellRinger;
 use crate::node::Node;

@@ -5,22 +5,22 @@ mod place;
 use std::time::Duration;
 
 use place::Place;
-use schema::limits::TopicLimits;
-use schema::{
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{
     Contents, Failure, Header, Kind, Request, Response, Scan, ScanHead, Status, Telegram, Topic, Verb, Wake,
     limits,
 };
-use shm::{HubLock, ListenLock, holder, is_starting, publisher};
-use shm::{Payload, PortFactory, SharedMemory, Waker};
+use scanhub_shm::{HubLock, ListenLock, holder, is_starting, publisher};
+use scanhub_shm::{Payload, PortFactory, SharedMemory, Waker};
 
 #[test]
 fn a_scan_is_written_and_read_in_place() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let publisher = Scan::publisher(&topic, &LIMITS).unwrap();
 
-    let client = shm::client_node(&place.domain).unwrap();
+    let client = scanhub_shm::client_node(&place.domain).unwrap();
     let seen = Scan::open(&client, "front").unwrap().expect("the hub made it");
     let subscriber = Scan::subscriber(&seen).unwrap();
 
@@ -47,7 +47,7 @@ fn a_scan_is_written_and_read_in_place() {
 #[test]
 fn a_telegram_is_as_long_as_it_is() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = <[u8]>::create(&hub, "front", &LIMITS).unwrap();
     let publisher = <[u8]>::publisher(&topic, &LIMITS).unwrap();
     let subscriber = <[u8]>::subscriber(&topic).unwrap();
@@ -62,7 +62,7 @@ fn a_telegram_is_as_long_as_it_is() {
 #[test]
 fn a_late_consumer_gets_the_last_status() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Status::create(&hub, "front", &LIMITS).unwrap();
     let publisher = Status::publisher(&topic, &LIMITS).unwrap();
     for baud in [9600, 38400] {
@@ -71,7 +71,7 @@ fn a_late_consumer_gets_the_last_status() {
         assert_eq!(sample.send().unwrap(), 0);
     }
     let subscriber = Status::subscriber(&topic).unwrap();
-    shm::UpdateConnections::update_connections(&publisher).unwrap();
+    scanhub_shm::UpdateConnections::update_connections(&publisher).unwrap();
     assert_eq!(Status::receive(&subscriber).unwrap().expect("history").baud, 38400);
     assert!(Status::receive(&subscriber).unwrap().is_none());
 }
@@ -79,7 +79,7 @@ fn a_late_consumer_gets_the_last_status() {
 #[test]
 fn a_full_queue_drops_the_oldest_and_nobody_waits() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let publisher = Scan::publisher(&topic, &LIMITS).unwrap();
     let subscriber = Scan::subscriber(&topic).unwrap();
@@ -96,10 +96,10 @@ fn a_full_queue_drops_the_oldest_and_nobody_waits() {
 #[test]
 fn a_second_publisher_is_refused() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let _first = Scan::publisher(&topic, &LIMITS).unwrap();
-    let other = shm::hub_node(&place.domain).unwrap();
+    let other = scanhub_shm::hub_node(&place.domain).unwrap();
     let again = Scan::create(&other, "front", &LIMITS).unwrap();
     assert_eq!(Scan::publisher(&again, &LIMITS).unwrap_err().kind, Kind::DomainHeld);
 }
@@ -107,7 +107,7 @@ fn a_second_publisher_is_refused() {
 #[test]
 fn limits_are_those_of_the_contract() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let scan = Scan::create(&hub, "front", &LIMITS).unwrap();
     let config = scan.static_config();
     assert_eq!((config.max_publishers(), config.max_subscribers(), config.max_nodes()), (1, 32, 260));
@@ -137,7 +137,7 @@ fn limits_are_those_of_the_contract() {
 #[test]
 fn a_topic_has_a_place_for_each_of_its_consumers_and_the_next_is_told_the_key() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let two = TopicLimits { consumers: 2, ..LIMITS };
     for (sensor, key) in [("front", "limits.consumers"), ("robot1.front", "--consumers")] {
         let topic = Scan::create(&hub, sensor, &two).unwrap();
@@ -153,7 +153,7 @@ fn a_topic_has_a_place_for_each_of_its_consumers_and_the_next_is_told_the_key() 
 #[test]
 fn a_topic_that_consumers_keep_alive_keeps_its_places() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let kept = Scan::create(&hub, "front", &TopicLimits { consumers: 2, ..LIMITS }).unwrap();
     for consumers in [1, 3] {
         let again = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { consumers, ..LIMITS }).unwrap();
@@ -170,11 +170,11 @@ const LIMITS: TopicLimits =
 #[test]
 fn consumers_wake_for_every_reason() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let waker = Waker::new(&hub, "front").unwrap();
-    let client = shm::client_node(&place.domain).unwrap();
-    let seen = shm::open_wake(&client, "front").unwrap().expect("the hub made it");
-    let listener = shm::listener(&seen).unwrap();
+    let client = scanhub_shm::client_node(&place.domain).unwrap();
+    let seen = scanhub_shm::open_wake(&client, "front").unwrap().expect("the hub made it");
+    let listener = scanhub_shm::listener(&seen).unwrap();
     let heard = || {
         let mut ids = Vec::new();
         listener.try_wait(|event| ids.push(event.id.as_value())).unwrap();
@@ -192,14 +192,14 @@ fn consumers_wake_for_every_reason() {
 #[test]
 fn what_is_not_there_is_nothing_and_sensors_are_listed() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     assert!(Scan::open(&hub, "front").unwrap().is_none());
-    assert!(shm::open_wake(&hub, "front").unwrap().is_none());
-    assert!(shm::sensors(&place.domain).unwrap().is_empty());
+    assert!(scanhub_shm::open_wake(&hub, "front").unwrap().is_none());
+    assert!(scanhub_shm::sensors(&place.domain).unwrap().is_empty());
     let _topics =
         (Scan::create(&hub, "rear", &LIMITS).unwrap(), Status::create(&hub, "rear", &LIMITS).unwrap());
     let _other = <[u8]>::create(&hub, "front", &LIMITS).unwrap();
-    assert_eq!(shm::sensors(&place.domain).unwrap(), ["front", "rear"]);
+    assert_eq!(scanhub_shm::sensors(&place.domain).unwrap(), ["front", "rear"]);
 }
 
 #[test]
@@ -228,7 +228,7 @@ fn one_hub_holds_a_domain() {
 #[test]
 fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let services = place.domain.root().join("services");
     let description = std::fs::read_dir(&services).unwrap().next().unwrap().unwrap().path();
@@ -237,39 +237,39 @@ fn a_hub_that_was_killed_while_making_a_topic_leaves_no_obstacle() {
     assert!(!description.exists());
     // Written, but not yet made read-only.
     std::fs::write(&description, text).unwrap();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     Scan::create(&hub, "front", &LIMITS).unwrap();
 }
 
 #[test]
 fn a_request_is_answered_and_both_are_woken() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
-    let server = shm::ControlServer::create(&hub).unwrap();
-    let node = shm::client_node(&place.domain).unwrap();
-    let client = shm::ControlClient::open(&node).unwrap().expect("the hub made it");
-    assert!(!shm::take_wakeups(&[client.responses()]).unwrap());
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
+    let server = scanhub_shm::ControlServer::create(&hub).unwrap();
+    let node = scanhub_shm::client_node(&place.domain).unwrap();
+    let client = scanhub_shm::ControlClient::open(&node).unwrap().expect("the hub made it");
+    assert!(!scanhub_shm::take_wakeups(&[client.responses()]).unwrap());
     let pending = client.ask(&Request::new("front", Verb::Pause)).unwrap();
-    shm::sleep(&[server.requests()], Duration::from_secs(60)).unwrap();
+    scanhub_shm::sleep(&[server.requests()], Duration::from_secs(60)).unwrap();
     let asked = server.receive().unwrap().expect("was asked");
     assert_eq!(asked.request(), Some(Request::new("front", Verb::Pause)));
-    assert!(server.receive().unwrap().is_none() && !shm::take_wakeups(&[server.requests()]).unwrap());
+    assert!(server.receive().unwrap().is_none() && !scanhub_shm::take_wakeups(&[server.requests()]).unwrap());
     assert!(pending.response().unwrap().is_none() && pending.is_open());
     let refusal = Response(Err(Failure::new(Kind::Short, "busy", "wait")));
     server.answer(asked, &refusal).unwrap();
-    assert!(shm::take_wakeups(&[client.responses()]).unwrap());
+    assert!(scanhub_shm::take_wakeups(&[client.responses()]).unwrap());
     assert_eq!(pending.response().unwrap(), Some(refusal));
 }
 
 #[test]
 fn clients_that_went_while_they_asked_are_no_obstacle() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
-    assert!(shm::ControlClient::open(&hub).unwrap().is_none());
-    let server = shm::ControlServer::create(&hub).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
+    assert!(scanhub_shm::ControlClient::open(&hub).unwrap().is_none());
+    let server = scanhub_shm::ControlServer::create(&hub).unwrap();
     for verb in [Verb::Pause, Verb::Resume].repeat(limits::CONTROL_CLIENTS) {
-        let node = shm::client_node(&place.domain).unwrap();
-        let client = shm::ControlClient::open(&node).unwrap().expect("the hub made it");
+        let node = scanhub_shm::client_node(&place.domain).unwrap();
+        let client = scanhub_shm::ControlClient::open(&node).unwrap().expect("the hub made it");
         let pending = client.ask(&Request::new("front", verb)).unwrap();
         if verb == Verb::Pause {
             // Received and then given up.
@@ -289,5 +289,5 @@ fn the_librarys_version_is_the_one_that_is_built_with() {
     let manifest = include_str!("../../../Cargo.toml");
     let pinned = manifest.lines().find_map(|line| line.strip_prefix("iceoryx2 = { version = \"="));
     let version = pinned.and_then(|rest| rest.split('"').next()).expect("it is pinned");
-    assert_eq!(shm::LIBRARY, format!("iceoryx2 {version}"));
+    assert_eq!(scanhub_shm::LIBRARY, format!("iceoryx2 {version}"));
 }

@@ -8,16 +8,16 @@ use std::thread;
 use place::Place;
 use rustix::fs::{FileType, Mode};
 use rustix::time::{ClockId, clock_gettime};
-use schema::limits::TopicLimits;
-use schema::{Kind, Ring, Scan, Wake};
-use shm::{Bell, Payload, Waker, sleep_at_bells};
-use shm::{Domain, HubLock, ListenLock};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Kind, Ring, Scan, Wake};
+use scanhub_shm::{Bell, Payload, Waker, sleep_at_bells};
+use scanhub_shm::{Domain, HubLock, ListenLock};
 
 #[test]
 fn one_ring_wakes_all_who_sleep_at_a_bell() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
-    let client = shm::client_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
+    let client = scanhub_shm::client_node(&place.domain).unwrap();
     assert!(Bell::open(&client, "front").unwrap().is_none());
     let (front, rear) = (Waker::new(&hub, "front").unwrap(), Waker::new(&hub, "rear").unwrap());
     let bell = |sensor| Bell::open(&client, sensor).unwrap().expect("the hub hung it");
@@ -50,7 +50,7 @@ fn one_ring_wakes_all_who_sleep_at_a_bell() {
 fn hubs_of_one_name_below_two_roots_have_bells_of_their_own() {
     let place = Place::new();
     let other = Domain::at(place.domain.name(), &place.base.join("other")).unwrap();
-    let [here, there] = [&place.domain, &other].map(|domain| shm::hub_node(domain).unwrap());
+    let [here, there] = [&place.domain, &other].map(|domain| scanhub_shm::hub_node(domain).unwrap());
     let mine = Waker::new(&here, "front").unwrap();
     let bell = Bell::open(&here, "front").unwrap().expect("the hub hung it");
     let rung = bell.rung(Ring::First);
@@ -67,7 +67,7 @@ fn hubs_of_one_name_below_two_roots_have_bells_of_their_own() {
 #[test]
 fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let killed = Waker::new(&hub, "front").unwrap();
     let bell = Bell::open(&hub, "front").unwrap().expect("the hub hung it");
     // A process that is killed closes nothing.
@@ -84,7 +84,7 @@ fn the_bell_of_a_killed_hub_is_rung_by_the_next_one() {
 #[test]
 fn a_bell_that_nobody_can_have_is_told() {
     let place = Place::new();
-    let hub = shm::hub_node(&place.domain).unwrap();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let prefix = std::fs::read_to_string(place.domain.root().join("prefix")).unwrap();
     let path = PathBuf::from("/dev/shm").join(format!("{}front.bell", prefix.trim_end()));
     rustix::fs::mknodat(rustix::fs::CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
@@ -115,9 +115,9 @@ fn the_last_one_out_takes_the_names_along() {
     };
     let lock = HubLock::acquire(root).unwrap();
     let first = prefix().expect("names are there with the lock");
-    let hub = shm::hub_node(&place.domain).unwrap();
-    let client = shm::client_node(&place.domain).unwrap();
-    assert_eq!(shm::is_member(&client, root), Ok(true));
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
+    let client = scanhub_shm::client_node(&place.domain).unwrap();
+    assert_eq!(scanhub_shm::is_member(&client, root), Ok(true));
     drop((hub, lock));
     assert_eq!(prefix().as_ref(), Some(&first), "a consumer waits for the next hub");
     let lock = HubLock::acquire(root).unwrap();
@@ -128,7 +128,7 @@ fn the_last_one_out_takes_the_names_along() {
     assert!(prefix().is_some(), "a listener is about to join");
     drop(listener);
     assert_eq!((prefix(), files()), (None, Vec::new()));
-    let failure = shm::client_node(&place.domain).unwrap_err();
+    let failure = scanhub_shm::client_node(&place.domain).unwrap_err();
     assert!(failure.message.contains("does not contain the name of the shared memory"), "{failure}");
     let _lock = HubLock::acquire(root).unwrap();
     assert!(prefix().is_some_and(|second| second != first));
@@ -142,14 +142,14 @@ fn at_the_longest_place_all_works() {
     let name = place.domain.name();
     let longest = (place.base.as_os_str().len() + 2..).map(|length| Domain::at(name, &base(length)));
     let domain = longest.take_while(Result::is_ok).last().expect("one is possible").unwrap();
-    let hub = shm::hub_node(&domain).unwrap();
+    let hub = scanhub_shm::hub_node(&domain).unwrap();
     let waker = Waker::new(&hub, &"s".repeat(24)).unwrap();
     let topic = Scan::create(&hub, "front", &TopicLimits::default()).unwrap();
     let (publisher, subscriber) =
         (Scan::publisher(&topic, &TopicLimits::default()).unwrap(), Scan::subscriber(&topic).unwrap());
-    let listener = shm::listener(waker.service()).unwrap();
+    let listener = scanhub_shm::listener(waker.service()).unwrap();
     waker.wake(Wake::Telegram).unwrap();
-    assert!(shm::take_wakeups(&[&listener]).unwrap());
+    assert!(scanhub_shm::take_wakeups(&[&listener]).unwrap());
     assert_eq!(Scan::loan(&publisher, 0).unwrap().send().unwrap(), 1);
     assert!(Scan::receive(&subscriber).unwrap().is_some());
 }

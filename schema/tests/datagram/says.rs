@@ -1,7 +1,7 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
-use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
-use schema::{
+use scanhub_schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
+use scanhub_schema::{
     BEAMS, Background, Cloud, Code, Early, Event, Family, Foreground, Lines, Marks, Motion, Obstacle,
     Obstacles, Scan, Status, Tilt, Topic, Tracks, Zones,
 };

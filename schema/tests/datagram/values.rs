@@ -4,8 +4,8 @@
 mod tilted;
 
 use bytemuck::Zeroable;
-use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
-use schema::{
+use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
+use scanhub_schema::{
     Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Event, EventKind,
     Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
     Segment, State, Status, Tilt, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
@@ -135,7 +135,7 @@ const KIND: &str = "LMS200;301063;V02.30";
 fn announce(room: &mut [u8]) -> Option<usize> {
     let mut announce = Announce::new(0x99AA_BBCC_DDEE_FF00, "front", KIND);
     for (topic, next) in [(Topic::Scan, u32::MAX - 1), (Topic::Zones, 5001), (Topic::Status, 3)] {
-        let group = schema::datagram::group(topic);
+        let group = scanhub_schema::datagram::group(topic);
         announce.add(Announced { topic: topic.number(), group, port: 22_200, next });
     }
     announce.pack(room)

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, Set, snake};
 use super::{rules, wrap};

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use schema::Topic;
-use schema::datagram::Announce;
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::Announce;
 
 use super::c::{above, commented, number_name};
 use super::description::{Description, Field, Kind, Layout, snake};

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 use syn::{Attribute, Expr, ImplItem, Item, Lit, Type};
 
 use super::rules;

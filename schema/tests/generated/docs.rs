@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use schema::datagram::Announce;
-use schema::{Maker, Topic};
+use scanhub_schema::datagram::Announce;
+use scanhub_schema::{Maker, Topic};
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first};
 use super::rules::{self, Tail};
@@ -132,7 +132,7 @@ pub(crate) fn services() -> String {
         };
         let payload =
             match (topic.payload(), topic.payload().trim_start_matches("scanhub.").trim_end_matches(".v2")) {
-                ("u8[]", _) => format!("`[u8]`, at most {}", schema::Telegram::MAX),
+                ("u8[]", _) => format!("`[u8]`, at most {}", scanhub_schema::Telegram::MAX),
                 (payload, name) if rules::tail(name).is_empty() => format!("`{payload}`"),
                 (payload, _) => format!("`[{payload}]`"),
             };

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, snake, upper_first};
 use super::readers::{self, Check, Finite, HEADS, How, Shown, names_of};

@@ -26,8 +26,8 @@ use std::path::Path;
 use std::{env, fs};
 
 use description::Description;
-use schema::Topic;
-use schema::limits::TopicLimits;
+use scanhub_schema::Topic;
+use scanhub_schema::limits::TopicLimits;
 
 const COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
 
@@ -82,7 +82,7 @@ fn wrap(first: &str, next: &str, text: &str, width: usize) -> String {
 #[test]
 fn sizes_are_those_of_the_structs() {
     let description = Description::read();
-    assert_eq!(description.layout("Header").size, size_of::<schema::Header>());
+    assert_eq!(description.layout("Header").size, size_of::<scanhub_schema::Header>());
     let limits = TopicLimits { beams: 0, contents: 0, ..TopicLimits::default() };
     for topic in Topic::ALL {
         let Some(layout) = description.payload(topic) else { continue };

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, upper_first};
 use super::readers::{self, Check, HEADS, How, Shown, layouts, names_of};
@@ -63,7 +63,7 @@ pub(crate) fn constants(description: &Description) -> String {
     let topics = ["announce"].into_iter().chain(Topic::ALL.map(Topic::name));
     let mut text = tuple("TOPICS", topics.map(str::to_owned));
     let groups = Topic::ALL.map(|topic| topic.row().group);
-    let groups = [schema::datagram::Announce::GROUP].into_iter().chain(groups);
+    let groups = [scanhub_schema::datagram::Announce::GROUP].into_iter().chain(groups);
     text +=
         &format!("_GROUPS = ({})\n", groups.map(|group| group.to_string()).collect::<Vec<_>>().join(", "));
     for set in readers::enums(description) {

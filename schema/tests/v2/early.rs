@@ -2,7 +2,7 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Early, Verdict};
+use scanhub_schema::{Early, Verdict};
 
 use super::{golden, shared};
 

@@ -2,7 +2,7 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Corner, LINES, Line, Lines};
+use scanhub_schema::{Corner, LINES, Line, Lines};
 
 use super::{golden, shared};
 

@@ -2,7 +2,7 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Motion, MotionMethod};
+use scanhub_schema::{Motion, MotionMethod};
 
 use super::{golden, shared};
 

@@ -2,7 +2,7 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{BEAMS, Code, Contents, Family, Scan, ScanHead, ScanWord};
+use scanhub_schema::{BEAMS, Code, Contents, Family, Scan, ScanHead, ScanWord};
 
 use super::{golden, shared};
 

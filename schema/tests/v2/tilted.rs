@@ -2,7 +2,9 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Cloud, CloudHead, CloudPoint, CloudWord, OBSTACLES, Obstacle, Obstacles, PointClass, Tilt};
+use scanhub_schema::{
+    Cloud, CloudHead, CloudPoint, CloudWord, OBSTACLES, Obstacle, Obstacles, PointClass, Tilt,
+};
 
 use super::{golden, shared};
 

@@ -2,7 +2,7 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Event, EventKind, Pose, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
+use scanhub_schema::{Event, EventKind, Pose, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
 
 use super::{golden, shared};
 

@@ -1,6 +1,6 @@
 //! The layouts of all payloads, and a program that reports the layouts of C: offset and size of every field.
 
-use schema::{Contents, Counter, Family, Header, Scan, ScanHead};
+use scanhub_schema::{Contents, Counter, Family, Header, Scan, ScanHead};
 
 struct Layout {
     /// Name in C.

@@ -1,8 +1,8 @@
 //! Datagrams with damage inside and a right checksum, and what `schema` says of them.
 
 use fastrand::Rng;
-use schema::Topic;
-use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_ETHERNET};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, Datagram, HEAD, Head, MTU_ETHERNET};
 use serde_json::{Value, json};
 
 use super::{says, vectors};

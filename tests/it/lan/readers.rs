@@ -4,8 +4,8 @@
 use std::io::{BufRead, BufReader, Write};
 use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
-use schema::datagram::{Datagram, Packed};
-use schema::{Counter, Scan};
+use scanhub_schema::datagram::{Datagram, Packed};
+use scanhub_schema::{Counter, Scan};
 use serde_json::{Map, Value, json};
 
 use crate::testkit::{Child, spawn};

@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::capture::{Capture, has_tshark};
 use super::{damaged, keyed_vectors, vectors};
 use crate::testkit::TestEnv;
-use schema::datagram::{HEAD, Head, Packed};
-use schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
+use scanhub_schema::datagram::{HEAD, Head, Packed};
+use scanhub_schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
 /// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
@@ -63,7 +63,7 @@ fn word(name: &str, value: &Value) -> String {
         }
         ("kind", Value::String(name)) => number(EventKind::ALL.iter().position(|known| known.name() == name)),
         ("method", Value::String(name)) => {
-            number(schema::MotionMethod::ALL.iter().position(|known| known.name() == name))
+            number(scanhub_schema::MotionMethod::ALL.iter().position(|known| known.name() == name))
         }
         ("boot" | "hub", Value::String(digits)) => format!("0x{digits}"),
         ("mode" | "flags", value) => format!("0x{:02x}", value.as_u64().expect("a byte")),

@@ -11,7 +11,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 use super::blocks::blocks;
 use super::shell::{commands, lines};
 use crate::testkit::{Program, Sender, TestEnv, in_a_network, side_by_side, until, write_program};
-use schema::Topic;
+use scanhub_schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
 /// program are read by `hub/cli/examples.rs`.

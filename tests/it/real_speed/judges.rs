@@ -2,8 +2,8 @@
 
 use std::collections::HashSet;
 
+use scanhub_sim::simulate::Record;
 use serde_json::Value;
-use sim::simulate::Record;
 
 use crate::testkit::{Outcome, bytes_of, number};
 

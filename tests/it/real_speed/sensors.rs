@@ -7,10 +7,10 @@ use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 
-use schema::Failure;
-use sim::options::SimulateOptions;
-use sim::simulate::{Record, Summary};
-use sim::{Event, simulate_with};
+use scanhub_schema::Failure;
+use scanhub_sim::options::SimulateOptions;
+use scanhub_sim::simulate::{Record, Summary};
+use scanhub_sim::{Event, simulate_with};
 
 use crate::testkit::{PATIENCE, TestEnv};
 

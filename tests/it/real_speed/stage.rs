@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use schema::{MILLIS, Nanos, Topic};
+use scanhub_schema::{MILLIS, Nanos, Topic};
+use scanhub_sim::Event;
+use scanhub_world::Action;
 use serde_json::Value;
-use sim::Event;
-use world::Action;
 
 use super::judges;
 use super::sensors::{SENSORS, Sensors};

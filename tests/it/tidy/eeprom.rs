@@ -45,9 +45,12 @@ fn nobody_writes_the_eeprom() {
                 "hub/drivers/src/lms/outgoing.rs",
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
-            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms_configure::Change;\n"),
-            tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse lms_configure::{eeprom, Plan};\n"),
-            tree.with("clients/verbs/src/planted.rs", "//! Knows.\nuse lms_configure::eeprom::Write;\n"),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\nuse scanhub_lms_configure::Change;\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nuse scanhub_lms_configure::{eeprom, Plan};\n"),
+            tree.with(
+                "clients/verbs/src/planted.rs",
+                "//! Knows.\nuse scanhub_lms_configure::eeprom::Write;\n",
+            ),
         ]
     });
 }

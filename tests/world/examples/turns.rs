@@ -5,7 +5,7 @@
 
 use std::fmt::Write as _;
 
-use world::{Detail, Figures, Plan, run};
+use scanhub_world::{Detail, Figures, Plan, run};
 
 const LD: [&str; 5] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
 /// Each mode of each model of RPLIDAR.

@@ -8,7 +8,7 @@ use std::rc::Rc;
 use bytemuck::pod_read_unaligned;
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Freshness, Noted, Numbers};
-use schema::{MICROS, MILLIS, Nanos, Topic, Verdict, Zones};
+use scanhub_schema::{MICROS, MILLIS, Nanos, Topic, Verdict, Zones};
 
 use crate::event::Event;
 use crate::shared::Shared;

@@ -1,9 +1,9 @@
 //! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
 
-use lan::outgoing;
-use schema::datagram::{Datagram, DatagramError, Row};
-use schema::{Header, Nanos, Ring, Status, Topic, Verdict, Zones};
-use sim::ld::TruePoint;
+use scanhub_lan::outgoing;
+use scanhub_schema::datagram::{Datagram, DatagramError, Row};
+use scanhub_schema::{Header, Nanos, Ring, Status, Topic, Verdict, Zones};
+use scanhub_sim::ld::TruePoint;
 
 use crate::consumer::Number;
 use crate::hash::History;

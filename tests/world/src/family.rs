@@ -10,14 +10,14 @@ use std::rc::Rc;
 use std::sync::{Arc, LazyLock};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::{MILLIS, Nanos, Scan};
-use sim::beam::NoiseModel;
-use sim::device::Device;
-use sim::ld::TruePoint;
-use sim::machine::ProtocolQuirks;
-use sim::room::Room;
-use sim::room::{Changes, PrecomputedScans};
-use sim::world::World as Scene;
+use scanhub_schema::{MILLIS, Nanos, Scan};
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::TruePoint;
+use scanhub_sim::machine::ProtocolQuirks;
+use scanhub_sim::room::Room;
+use scanhub_sim::room::{Changes, PrecomputedScans};
+use scanhub_sim::world::World as Scene;
 
 use crate::plan::Action;
 
@@ -30,7 +30,7 @@ pub(crate) trait Family {
     fn auto(&self) -> Rc<dyn Family>;
 
     /// Returns the family, or both families of a scanner that is exchanged for a scanner of another family.
-    fn families(&self) -> Vec<schema::Family>;
+    fn families(&self) -> Vec<scanhub_schema::Family>;
 
     /// Returns the rates that the line may have, in bits per second.
     fn rates(&self) -> Vec<u32>;
@@ -179,8 +179,8 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
 /// if it does not rotate.
 pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dyn Family> {
     let second: Rc<dyn Family> = match first.families()[..] {
-        [schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
-        [schema::Family::Rplidar] => Rc::new(ld::Ld::draw(random)),
+        [scanhub_schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
+        [scanhub_schema::Family::Rplidar] => Rc::new(ld::Ld::draw(random)),
         _ => return first,
     };
     let second = second.auto();

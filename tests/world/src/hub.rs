@@ -3,9 +3,9 @@
 
 use std::rc::Rc;
 
-use daemon::platform::{Wait, WaitSource, WakeReason};
-use daemon::{CommandSender, LiveLink, Reload, Service, StateSaver, StateStore};
-use schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
+use scanhub_daemon::platform::{Wait, WaitSource, WakeReason};
+use scanhub_daemon::{CommandSender, LiveLink, Reload, Service, StateSaver, StateStore};
+use scanhub_schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
 use crate::event::Event;
 use crate::setup::Setup;

@@ -1,13 +1,13 @@
-//! A hub's end of a port: it implements [`daemon::platform::Line`] with a simulated tty.
+//! A hub's end of a port: it implements [`scanhub_daemon::platform::Line`] with a simulated tty.
 
 use std::cell::Cell;
 use std::io;
 use std::path::Path;
 use std::rc::Rc;
 
-use daemon::platform::Line;
-use port::{Allowance, Alteration};
-use schema::Nanos;
+use scanhub_daemon::platform::Line;
+use scanhub_port::{Allowance, Alteration};
+use scanhub_schema::Nanos;
 
 use crate::event::Event;
 use crate::planted::{Defect, eeprom_request};

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Parser;
-use world::{Detail, Outcome, Plan, Runner, Totals, corpus, run, shrink};
+use scanhub_world::{Detail, Outcome, Plan, Runner, Totals, corpus, run, shrink};
 
 /// Simulates whole hubs in made-up time, and watches what they promise.
 #[derive(Debug, Parser)]

@@ -5,8 +5,8 @@
 use std::fmt;
 use std::str::FromStr;
 
-use schema::{MILLIS, Nanos};
-use sim::fault::Faults;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::fault::Faults;
 
 use crate::actions::{self, KINDS, Kind};
 use crate::family;

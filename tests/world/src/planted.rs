@@ -4,7 +4,7 @@
 use std::cell::Cell;
 
 use scanhub_drivers::lms::telegram::Writer;
-use schema::{Counter, Family, Flags, Header, Scan, ScanHead, Status, Topic};
+use scanhub_schema::{Counter, Family, Flags, Header, Scan, ScanHead, Status, Topic};
 
 /// A defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

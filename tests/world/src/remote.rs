@@ -13,10 +13,10 @@ use std::collections::HashMap;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use lan::{Key, Stamp};
 use scanhub_client::clock::Moment;
-use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
-use schema::{MICROS, MILLIS, Nanos, Topic};
+use scanhub_lan::{Key, Stamp};
+use scanhub_schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
+use scanhub_schema::{MICROS, MILLIS, Nanos, Topic};
 
 use crate::actions;
 use crate::event::Event;

@@ -3,11 +3,11 @@
 
 use std::collections::VecDeque;
 
-use schema::{MICROS, Nanos, line_time};
-use sim::Arrival;
-use sim::fault::Faults;
-use sim::ld::TruePoint;
-use sim::wire::{Delivery, LineModel};
+use scanhub_schema::{MICROS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::ld::TruePoint;
+use scanhub_sim::wire::{Delivery, LineModel};
 
 use crate::family::{Ailment, Scanner};
 use crate::plan::Action;

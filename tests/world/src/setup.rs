@@ -3,9 +3,9 @@
 
 use std::rc::Rc;
 
-use config::{Config, Sources};
-use schema::{Failure, Topic};
-use sim::room::Changes;
+use scanhub_config::{Config, Sources};
+use scanhub_schema::{Failure, Topic};
+use scanhub_sim::room::Changes;
 
 use crate::consumer::Habit;
 use crate::family::{self, Family};

@@ -5,7 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use schema::{Nanos, Ring};
+use scanhub_schema::{Nanos, Ring};
 
 use crate::event::{Detail, Event, Figures, Violation};
 use crate::hash::History;

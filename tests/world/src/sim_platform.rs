@@ -1,16 +1,16 @@
-//! The platform of one link in a world: it implements [`daemon::platform::Platform`] with simulated ports, topics and
+//! The platform of one link in a world: it implements [`scanhub_daemon::platform::Platform`] with simulated ports, topics and
 //! files.
 
 use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 
-use daemon::SaveQueue;
-use daemon::platform::{Platform, SavedState};
-use port::{PortError, Source};
 use rustix::io::Errno;
-use schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
-use shm::Payload;
+use scanhub_daemon::SaveQueue;
+use scanhub_daemon::platform::{Platform, SavedState};
+use scanhub_port::{PortError, Source};
+use scanhub_schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
+use scanhub_shm::Payload;
 
 use crate::event::Event;
 use crate::line::{Handle, LinkClock, OpenLine};
@@ -23,7 +23,7 @@ pub(crate) struct SimPlatform<'a> {
     pub(crate) shared: Rc<Shared>,
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
-    pub(crate) save_slot: Option<daemon::SaveSlot<'a>>,
+    pub(crate) save_slot: Option<scanhub_daemon::SaveSlot<'a>>,
     /// A planted defect owes the first ring.
     is_owed: Cell<bool>,
 }

@@ -9,9 +9,9 @@ use std::fmt::Debug;
 use std::marker::PhantomData;
 use std::rc::Rc;
 
-use schema::limits::TopicLimits;
-use schema::{Early, Header, Nanos, Topic, Verdict, limits};
-use shm::{LoanError, Medium, Payload, SendError};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Early, Header, Nanos, Topic, Verdict, limits};
+use scanhub_shm::{LoanError, Medium, Payload, SendError};
 
 use crate::consumer::Number;
 use crate::event::Event;

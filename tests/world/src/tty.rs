@@ -3,11 +3,11 @@
 
 use std::collections::VecDeque;
 
-use port::PortError;
-use schema::Nanos;
-use sim::device::{Part, Sent};
-use sim::wire::BaudMismatch;
-use sim::wire::Delivery;
+use scanhub_port::PortError;
+use scanhub_schema::Nanos;
+use scanhub_sim::device::{Part, Sent};
+use scanhub_sim::wire::BaudMismatch;
+use scanhub_sim::wire::Delivery;
 
 use crate::event::{Event, Telegram};
 use crate::sensor::{Happening, Sensor};

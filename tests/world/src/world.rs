@@ -5,9 +5,9 @@ use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use daemon::CommandSender;
-use schema::{MILLIS, Nanos, Topic, Verb};
-use sim::fault::Faults;
+use scanhub_daemon::CommandSender;
+use scanhub_schema::{MILLIS, Nanos, Topic, Verb};
+use scanhub_sim::fault::Faults;
 
 use crate::actions::object;
 use crate::consumer::{Consumer, Habit, Number};

@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use world::{Defect, Detail, Plan, is_found, run};
+use scanhub_world::{Defect, Detail, Plan, is_found, run};
 
 fn judge(defect: Defect) -> &'static [&'static str] {
     match defect {

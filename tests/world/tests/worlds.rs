@@ -3,7 +3,7 @@
 use std::sync::atomic::AtomicBool;
 use std::thread;
 
-use world::{Detail, Plan, Runner, corpus, run};
+use scanhub_world::{Detail, Plan, Runner, corpus, run};
 
 #[test]
 fn what_was_mended_stays_so() {

@@ -2,9 +2,9 @@
 
 use std::cell::RefCell;
 
-use schema::datagram::{Head, Packed};
-use schema::limits::TopicLimits;
-use schema::{Kind, Zones};
+use scanhub_schema::datagram::{Head, Packed};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Kind, Zones};
 
 use super::*;
 
@@ -55,7 +55,7 @@ fn run(heard: Vec<Heard>, is_over: bool, ask: impl Fn(&str) -> Result<(), Failur
 
 fn zones(sequence: u32) -> Heard {
     let mut buffer = [0; 100];
-    let len = Zones::unknown().pack(&mut buffer[schema::datagram::HEAD..]).unwrap();
+    let len = Zones::unknown().pack(&mut buffer[scanhub_schema::datagram::HEAD..]).unwrap();
     let head =
         Head { topic: Topic::Zones.number(), revision: 1, hub: HUB, epoch: 1, sequence, ..Head::default() };
     Heard::Sample(

@@ -5,11 +5,11 @@ use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::ops::Index;
 
-use lan::Stamp;
-use lan::outgoing::{PayloadRef, Sample};
-use ros::zenoh_wire::Qos;
-use ros::{DIAGNOSTICS, Names, TF_STATIC, Type};
-use schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};
+use scanhub_lan::Stamp;
+use scanhub_lan::outgoing::{PayloadRef, Sample};
+use scanhub_ros::zenoh_wire::Qos;
+use scanhub_ros::{DIAGNOSTICS, Names, TF_STATIC, Type};
+use scanhub_schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};
 
 /// The graph of one hub.
 #[derive(Debug)]
@@ -141,15 +141,15 @@ impl Graph {
             every[topic as usize].map(|_| self.publish(self.names.topic(name, word), of, Qos::SensorData))
         };
         let mut slots = Slots {
-            scan: slot(Topic::Scan, "scan", ros::LASER_SCAN),
-            foreground: slot(Topic::Foreground, "foreground", ros::POINT_CLOUD),
-            marks: slot(Topic::Marks, "marks", ros::MARKER_ARRAY),
-            zones: slot(Topic::Zones, "zones", ros::MARKER_ARRAY),
-            verdict: slot(Topic::Zones, "verdict", ros::STRING),
-            cloud: slot(Topic::Cloud, "cloud", ros::POINT_CLOUD),
+            scan: slot(Topic::Scan, "scan", scanhub_ros::LASER_SCAN),
+            foreground: slot(Topic::Foreground, "foreground", scanhub_ros::POINT_CLOUD),
+            marks: slot(Topic::Marks, "marks", scanhub_ros::MARKER_ARRAY),
+            zones: slot(Topic::Zones, "zones", scanhub_ros::MARKER_ARRAY),
+            verdict: slot(Topic::Zones, "verdict", scanhub_ros::STRING),
+            cloud: slot(Topic::Cloud, "cloud", scanhub_ros::POINT_CLOUD),
             diagnosis: None,
-            people: slot(Topic::Tracks, "tracks", ros::MARKER_ARRAY),
-            poses: slot(Topic::Tracks, "poses", ros::POSE_ARRAY),
+            people: slot(Topic::Tracks, "tracks", scanhub_ros::MARKER_ARRAY),
+            poses: slot(Topic::Tracks, "poses", scanhub_ros::POSE_ARRAY),
         };
         if every[Topic::Status as usize].is_some() {
             slots.diagnosis = Some(self.publish_diagnostics());
@@ -185,7 +185,7 @@ impl Graph {
             // The word that nothing comes any more is as good as a sample of the verdict.
             if let PayloadRef::Zones(zones) = sample.payload {
                 let slot = self.sensors[sensor].slots.verdict;
-                self.write(slot, now, |message| ros::verdict_word(message, zones.verdict()));
+                self.write(slot, now, |message| scanhub_ros::verdict_word(message, zones.verdict()));
             }
             return;
         };
@@ -201,7 +201,9 @@ impl Graph {
         match sample.payload {
             PayloadRef::Scan(scan) => {
                 if goes_out {
-                    self.write(slots.scan, now, |message| ros::laser_scan(message, &frame, header, scan));
+                    self.write(slots.scan, now, |message| {
+                        scanhub_ros::laser_scan(message, &frame, header, scan)
+                    });
                 }
                 self.scan(sensor, header, scan, now);
             }
@@ -209,15 +211,21 @@ impl Graph {
                 self.foreground(sensor, header, foreground, now)
             }
             PayloadRef::Marks(marks) if goes_out => {
-                self.write(slots.marks, now, |message| ros::mark_markers(message, &frame, header, marks));
+                self.write(slots.marks, now, |message| {
+                    scanhub_ros::mark_markers(message, &frame, header, marks)
+                });
             }
             PayloadRef::Zones(zones) if goes_out => {
-                self.write(slots.zones, now, |message| ros::zone_markers(message, header, zones));
-                self.write(slots.verdict, now, |message| ros::verdict_word(message, zones.verdict()));
+                self.write(slots.zones, now, |message| scanhub_ros::zone_markers(message, header, zones));
+                self.write(slots.verdict, now, |message| scanhub_ros::verdict_word(message, zones.verdict()));
             }
             PayloadRef::Tracks(tracks) if goes_out => {
-                self.write(slots.people, now, |message| ros::people_markers(message, &frame, header, tracks));
-                self.write(slots.poses, now, |message| ros::people_poses(message, &frame, header, tracks));
+                self.write(slots.people, now, |message| {
+                    scanhub_ros::people_markers(message, &frame, header, tracks)
+                });
+                self.write(slots.poses, now, |message| {
+                    scanhub_ros::people_poses(message, &frame, header, tracks)
+                });
             }
             _ => {}
         }
@@ -234,7 +242,9 @@ impl Graph {
         let is_due = now_ns.saturating_sub(self.hub.told_ns) >= SAID_EVERY_NS;
         if is_due && (is_hub_there || is_absent) {
             self.hub.told_ns = now_ns;
-            self.write(self.hub.slot, now, |message| ros::hub_diagnosis(message, now_ns, is_hub_there));
+            self.write(self.hub.slot, now, |message| {
+                scanhub_ros::hub_diagnosis(message, now_ns, is_hub_there)
+            });
         }
         for sensor in 0..self.sensors.len() {
             let Sensor { name, slots, heard_ns, told_ns, .. } = &mut self.sensors[sensor];
@@ -243,7 +253,7 @@ impl Graph {
             if is_silent && now_ns.saturating_sub(*told_ns) >= SAID_EVERY_NS {
                 *told_ns = now_ns;
                 let (slot, name) = (slots.diagnosis, name.clone());
-                self.write(slot, now, |message| ros::diagnosis(message, &name, now_ns, None, None));
+                self.write(slot, now, |message| scanhub_ros::diagnosis(message, &name, now_ns, None, None));
             }
         }
     }
@@ -289,7 +299,7 @@ impl Graph {
         (known.heard_ns, known.told_ns) = (Some(now_ns), now_ns);
         let age_ns = known.scanned_ns.map(|scanned_ns| now_ns.saturating_sub(scanned_ns));
         let (slot, name) = (known.slots.diagnosis, known.name.clone());
-        self.write(slot, now, |message| ros::diagnosis(message, &name, now_ns, Some(status), age_ns));
+        self.write(slot, now, |message| scanhub_ros::diagnosis(message, &name, now_ns, Some(status), age_ns));
         let frame = self.names.frame(&name);
         match self.poses.iter_mut().find(|(of, _)| of == frame) {
             Some((_, pose)) if *pose == status.pose => return,
@@ -298,10 +308,10 @@ impl Graph {
         }
         if self.poses_slot.is_none() {
             let topic = self.names.shared(TF_STATIC);
-            self.poses_slot = Some(self.publish(topic, ros::TF_MESSAGE, Qos::Latched));
+            self.poses_slot = Some(self.publish(topic, scanhub_ros::TF_MESSAGE, Qos::Latched));
         }
         let (slot, poses) = (self.poses_slot, std::mem::take(&mut self.poses));
-        self.write(slot, now, |message| ros::static_transforms(message, header.wall_ns, &poses));
+        self.write(slot, now, |message| scanhub_ros::static_transforms(message, header.wall_ns, &poses));
         self.poses = poses;
     }
 
@@ -333,7 +343,9 @@ impl Graph {
         let (slot, scans) = (known.slots.foreground, std::mem::take(&mut known.scans));
         let frame = self.names.frame(&self.sensors[sensor].name).to_owned();
         let (_, scan) = scans.index(place);
-        self.write(slot, now, |message| ros::foreground_cloud(message, &frame, header, scan, foreground));
+        self.write(slot, now, |message| {
+            scanhub_ros::foreground_cloud(message, &frame, header, scan, foreground)
+        });
         self.sensors[sensor].scans = scans;
     }
 
@@ -342,14 +354,14 @@ impl Graph {
         let known = &mut self.sensors[sensor];
         let (slot, mut sweep) = (known.slots.cloud, std::mem::take(&mut known.sweep));
         if let Some(points) = sweep.take(header, cloud) {
-            self.write(slot, now, |message| ros::sweep_cloud(message, header, points));
+            self.write(slot, now, |message| scanhub_ros::sweep_cloud(message, header, points));
         }
         self.sensors[sensor].sweep = sweep;
     }
 
     /// A new place for messages of how something is.
     fn publish_diagnostics(&mut self) -> usize {
-        self.publish(self.names.shared(DIAGNOSTICS), ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
+        self.publish(self.names.shared(DIAGNOSTICS), scanhub_ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
     }
 
     /// A new place for messages of the topic called `name`.

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use scanhub_files::regular;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 use zenoh::Config;
 use zenoh::config::{EndPoint, WhatAmI};
 

@@ -1,7 +1,7 @@
 //! Peers that mean harm: whatever they send is refused, counted, and takes no memory; who is honest is heard.
 
-use schema::datagram::{HEAD, Head};
-use schema::{State, Status, Topic, Verdict, Zones};
+use scanhub_schema::datagram::{HEAD, Head};
+use scanhub_schema::{State, Status, Topic, Verdict, Zones};
 use zenoh::{Session, Wait};
 
 use crate::testkit::{INT, Program, Sender, TestEnv, number, until};

@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::process::Command;
 
-use schema::datagram::Datagram;
+use scanhub_schema::datagram::Datagram;
 use serde_json::Value;
 use zenoh::Wait;
 

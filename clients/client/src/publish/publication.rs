@@ -1,10 +1,10 @@
 //! A topic that is being published: its samples get headers and numbers, and wake who follows it. Refuses to know who else
 //! publishes.
 
-use schema::limits::TopicLimits;
-use schema::{Failure, Header, Maker, Topic, Wake};
-use shm::Domain;
-use shm::{Payload, TopicPublisher};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Header, Maker, Topic, Wake};
+use scanhub_shm::Domain;
+use scanhub_shm::{Payload, TopicPublisher};
 
 use super::{PublishSession, SensorPublisher};
 use crate::clock;
@@ -90,7 +90,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) if it is longer than the topic was made for.
+    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) if it is longer than the topic was made for.
     pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
         let header = self.header();
         self.send_len_with(&header, len, fill)?;
@@ -102,7 +102,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than the topic was made for: its number is
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than the topic was made for: its number is
     /// used up.
     pub fn send_len_with(
         &mut self,
@@ -119,7 +119,7 @@ impl<P: Payload> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up. Else as
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up. Else as
     /// [`SensorPublisher::wake`].
     pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
         let header = self.header();
@@ -144,7 +144,7 @@ impl<P: Payload> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up.
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up.
     pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
         self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
     }
@@ -155,8 +155,8 @@ impl Publication<[u8]> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) for more than
-    /// [`Telegram::MAX`](schema::Telegram::MAX) bytes.
+    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) for more than
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
     pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Failure> {
         let header = self.header();
         self.send_bytes_with(&header, bytes)?;
@@ -167,8 +167,8 @@ impl Publication<[u8]> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than
-    /// [`Telegram::MAX`](schema::Telegram::MAX).
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
     pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }

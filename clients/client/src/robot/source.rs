@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Failure, is_remote};
+use scanhub_schema::{Failure, is_remote};
 
 use super::Robot;
 use crate::clock;
@@ -170,7 +170,7 @@ impl RobotSource {
         self.call_at = Some(now + CALL_EVERY);
         let whose = whose.or(session.publishes());
         let is_followed = |sensor: &String| is_remote(sensor) == (whose == Some(Who::Listener));
-        for sensor in shm::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
+        for sensor in scanhub_shm::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
             self.whose = Whose::All(whose);
             self.meet(&sensor);
         }
@@ -201,7 +201,7 @@ impl RobotSource {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Verdict;
+    use scanhub_schema::Verdict;
 
     #[test]
     fn remote_sensors_without_number_are_one_unknown_part() {
@@ -217,7 +217,7 @@ mod tests {
             zones.verdict = Verdict::Clear as u8;
         }
         assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS)));
-        assert!(schema::check_followed(OTHERS).is_err(), "no sensor has its name");
+        assert!(scanhub_schema::check_followed(OTHERS).is_err(), "no sensor has its name");
         // A hub's own sensors are as many as its configuration says.
         let mut source = RobotSource::new(&[]);
         (0..40).for_each(|n| source.meet(&format!("front{n}")));

@@ -1,9 +1,9 @@
 //! Wakers and sleepers in domains of their own.
 
 use super::*;
-use schema::Wake;
-use shm::Domain;
-use shm::Waker;
+use scanhub_schema::Wake;
+use scanhub_shm::Domain;
+use scanhub_shm::Waker;
 use std::path::PathBuf;
 use std::sync::mpsc;
 use std::thread;
@@ -43,7 +43,7 @@ fn woken(started: Instant) -> bool {
 fn hub(domain: &Domain, sensor: &'static str) -> mpsc::Sender<()> {
     let (tell, told) = mpsc::channel();
     let (say, said) = mpsc::channel();
-    let node = shm::hub_node(domain).unwrap();
+    let node = scanhub_shm::hub_node(domain).unwrap();
     thread::spawn(move || {
         let waker = Waker::new(&node, sensor).unwrap();
         say.send(()).unwrap();
@@ -60,8 +60,8 @@ const FOLLOWED: [&[Topic]; 3] = [&[Topic::Zones], &[Topic::Marks], &[Topic::Stat
 #[test]
 fn each_topic_is_told_by_its_ring() {
     let place = Place::new("rings");
-    let hub = shm::hub_node(&place.1).unwrap();
-    let node = shm::client_node(&place.1).unwrap();
+    let hub = scanhub_shm::hub_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     let waker = Waker::new(&hub, "front").unwrap();
     for (topics, told) in
         FOLLOWED.into_iter().zip([&[Ring::First][..], &[Ring::Last], &[Ring::First, Ring::Last]])
@@ -96,7 +96,7 @@ fn wakes_for_every_sensor(wait: Wait, name: &str, topics: &[Topic]) {
     let place = Place::new(name);
     let mut wakeups = Wakeups::by(wait);
     let hubs = ["front", "rear"].map(|sensor| hub(&place.1, sensor));
-    let node = shm::client_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     assert!(!wakeups.add(&node, "left", Topic::Zones).unwrap(), "there is no such sensor");
     for (at, sensor) in ["front", "rear"].into_iter().enumerate() {
         topics.iter().for_each(|&topic| assert!(wakeups.add(&node, sensor, topic).unwrap()));
@@ -115,8 +115,8 @@ fn wakes_for_every_sensor(wait: Wait, name: &str, topics: &[Topic]) {
 #[test]
 fn the_bell_of_a_hub_that_ended_is_exchanged() {
     let place = Place::new("ended");
-    let hub = shm::hub_node(&place.1).unwrap();
-    let node = shm::client_node(&place.1).unwrap();
+    let hub = scanhub_shm::hub_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     let mut wakeups = Wakeups::by(Wait::Doorbell);
     let first = Waker::new(&hub, "front").unwrap();
     assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
@@ -137,8 +137,8 @@ fn the_bell_of_a_hub_that_ended_is_exchanged() {
 #[test]
 fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
     let place = Place::new("removed");
-    let hub = shm::hub_node(&place.1).unwrap();
-    let node = shm::client_node(&place.1).unwrap();
+    let hub = scanhub_shm::hub_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     let mut wakeups = Wakeups::by(Wait::Doorbell);
     // A hub that is killed closes nothing.
     std::mem::forget(Waker::new(&hub, "front").unwrap());
@@ -160,8 +160,8 @@ fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
 #[test]
 fn an_event_that_is_made_later_is_listened_to() {
     let place = Place::new("later");
-    let hub = shm::hub_node(&place.1).unwrap();
-    let node = shm::client_node(&place.1).unwrap();
+    let hub = scanhub_shm::hub_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     let mut wakeups = Wakeups::by(Wait::Doorbell);
     let first = Waker::new(&hub, "front").unwrap();
     assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
@@ -179,8 +179,8 @@ fn an_event_that_is_made_later_is_listened_to() {
 #[test]
 fn where_words_cannot_be_waited_for_the_event_wakes() {
     let place = Place::new("turn");
-    let hub = shm::hub_node(&place.1).unwrap();
-    let node = shm::client_node(&place.1).unwrap();
+    let hub = scanhub_shm::hub_node(&place.1).unwrap();
+    let node = scanhub_shm::client_node(&place.1).unwrap();
     let waker = Waker::new(&hub, "front").unwrap();
     let mut wakeups = Wakeups::by(Wait::Doorbell);
     assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use schema::{Header, Zones};
+use scanhub_schema::{Header, Zones};
 
 use super::Heard;
 use crate::clock::Moment;

@@ -1,7 +1,7 @@
 //! Zones with the early warnings of their sensor: a warning makes the verdict worse until the zones of the same scan are there,
 //! or until it is withdrawn. It never makes it better. Refuses to know where samples come from.
 
-use schema::{Early, Header, Verdict, Zones};
+use scanhub_schema::{Early, Header, Verdict, Zones};
 
 /// What is known of one sensor's zones, and what was said of the scan after that.
 #[derive(Clone, Debug)]

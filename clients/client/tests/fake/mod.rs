@@ -10,12 +10,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
-use schema::limits::TopicLimits;
-use schema::{
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{
     Background, Failure, Foreground, Header, Marks, Scan, ScanHead, State, Status, Verdict, Wake, Zones,
 };
-use shm::{Domain, HubLock};
-use shm::{Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker};
+use scanhub_shm::{Domain, HubLock};
+use scanhub_shm::{Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker};
 use tempfile::TempDir;
 
 /// A domain that goes with the test.
@@ -189,7 +189,7 @@ pub(crate) struct FakeHub {
 impl FakeHub {
     pub(crate) fn new(domain: &Domain, sensors: &[&str], boot: u64) -> FakeHub {
         let lock = HubLock::acquire(domain.root()).unwrap();
-        let node = shm::hub_node(domain).unwrap();
+        let node = scanhub_shm::hub_node(domain).unwrap();
         let sensor = |name: &&str| FakeSensor {
             telegram: Port::new(&node, name),
             scan: Port::new(&node, name),

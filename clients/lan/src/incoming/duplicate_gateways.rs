@@ -3,7 +3,7 @@
 //! apart.) Told apart from a gateway that was started anew, of whose life before something comes late. Time is an argument;
 //! refuses to know why a datagram is refused.
 
-use schema::datagram::LIVES;
+use scanhub_schema::datagram::LIVES;
 
 /// The gateways of which something was refused as of a life that is over.
 #[derive(Default)]

@@ -4,7 +4,7 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use schema::datagram::{Announce, Datagram, DatagramError, Head, StreamStats};
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head, StreamStats};
 
 use crate::Key;
 
@@ -90,8 +90,8 @@ pub const GATEWAYS: usize = 1024;
 
 #[cfg(test)]
 mod tests {
-    use schema::datagram::{Announced, HEAD, PORT, Packed, group};
-    use schema::{Topic, Zones};
+    use scanhub_schema::datagram::{Announced, HEAD, PORT, Packed, group};
+    use scanhub_schema::{Topic, Zones};
 
     use super::super::{Arrived, Incoming};
     use super::*;

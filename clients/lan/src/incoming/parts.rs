@@ -1,7 +1,7 @@
 //! Samples that come in parts, until they are whole: parts in any order, some twice, some never. However much comes, and from
 //! whomever, the memory for it is bounded. Refuses to know what is in a part, and whether its sample is wanted.
 
-use schema::datagram::{Datagram, Head, PART_LONGEST};
+use scanhub_schema::datagram::{Datagram, Head, PART_LONGEST};
 
 /// The samples that are not whole yet. Those that never will be make room for others, and nobody hears of them again: their
 /// numbers did not arrive.

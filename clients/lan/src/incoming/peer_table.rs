@@ -3,8 +3,8 @@
 
 use std::collections::{HashMap, HashSet};
 
-use schema::Topic;
-use schema::datagram::{Announce, Head, LIVES, StreamStats};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, Head, LIVES, StreamStats};
 
 /// All lives of gateways that were heard, as long as the account keeps them apart.
 #[derive(Default)]
@@ -186,8 +186,8 @@ impl Delays {
 mod tests {
     use super::*;
 
-    use schema::Zones;
-    use schema::datagram::{Announced, HEAD, Packed};
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{Announced, HEAD, Packed};
 
     const MS: u64 = 1_000_000;
 

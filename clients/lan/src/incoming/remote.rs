@@ -1,8 +1,8 @@
 //! A datagram that was accepted, as a sample: its header and payload in the words of shared memory. Refuses to know where it
 //! goes.
 
-use schema::datagram::{Datagram, Head, LanFlags, Packed};
-use schema::{Flags, Header, Quality, Topic};
+use scanhub_schema::datagram::{Datagram, Head, LanFlags, Packed};
+use scanhub_schema::{Flags, Header, Quality, Topic};
 
 /// A sample of another machine.
 pub struct Remote<'a> {

@@ -2,8 +2,8 @@
 //! buffer that is always the same; at once, or when it is asked for. Refuses to know where samples come from and where
 //! datagrams go.
 
-use schema::Topic;
-use schema::datagram::{Announce, Announced, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, Announced, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
 
 use super::slots::Slots;
 use crate::{Key, Stamp};

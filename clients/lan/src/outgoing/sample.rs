@@ -1,7 +1,7 @@
 //! A sample as it is handed to a network's end: borrowed, wherever it lies. Refuses to know where that is.
 
-use schema::datagram::Packed;
-use schema::{Header, Topic};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Header, Topic};
 
 /// A sample of a topic, or the word that none comes.
 #[derive(Clone, Copy, Debug)]
@@ -20,7 +20,7 @@ macro_rules! payloads {
         /// The payload of any topic.
         #[derive(Clone, Copy, Debug)]
         pub enum PayloadRef<'a> {
-            $(#[doc = $about] $topic(&'a schema::payload_type!($payload)),)*
+            $(#[doc = $about] $topic(&'a scanhub_schema::payload_type!($payload)),)*
         }
 
         impl PayloadRef<'_> {
@@ -38,13 +38,13 @@ macro_rules! payloads {
     };
 }
 
-schema::for_each_topic!(payloads);
+scanhub_schema::for_each_topic!(payloads);
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    use schema::Zones;
+    use scanhub_schema::Zones;
 
     #[test]
     fn a_payload_knows_its_topic_and_packs_itself() {

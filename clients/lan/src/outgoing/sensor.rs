@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
-use schema::{Background, Family, Flags, Header, Quality, Topic, Verdict};
+use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
+use scanhub_schema::{Background, Family, Flags, Header, Quality, Topic, Verdict};
 
 use super::numbering::{Numbering, Transmit};
 use super::sample::{PayloadRef, Sample};

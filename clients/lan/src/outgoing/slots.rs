@@ -4,7 +4,7 @@
 
 use std::collections::VecDeque;
 
-use schema::datagram::Head;
+use scanhub_schema::datagram::Head;
 
 /// Samples that have no number yet, by sensor and topic.
 #[derive(Default)]

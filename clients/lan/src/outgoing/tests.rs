@@ -3,8 +3,10 @@
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE, StreamStats};
-use schema::{Background, BackgroundHead, Early, Family, Flags, Header, Status, Topic, Verdict, Zones};
+use scanhub_schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE, StreamStats};
+use scanhub_schema::{
+    Background, BackgroundHead, Early, Family, Flags, Header, Status, Topic, Verdict, Zones,
+};
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use crate::{Key, Stamp};

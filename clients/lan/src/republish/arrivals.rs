@@ -41,7 +41,7 @@ mod tests {
 
     use scanhub_client::clock::Moment;
     use scanhub_client::streams::Freshness;
-    use schema::{Flags, Header, Verdict};
+    use scanhub_schema::{Flags, Header, Verdict};
 
     const MS: u64 = 1_000_000;
 

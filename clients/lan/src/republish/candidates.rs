@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
-use schema::Topic;
-use schema::datagram::{Datagram, Head};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Datagram, Head};
 
 use super::SENSORS;
 use crate::incoming::Remote;

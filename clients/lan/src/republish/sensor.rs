@@ -1,8 +1,8 @@
 //! The topics of one remote sensor: which there are, and what is said of it when nothing comes. Refuses to know how a sample
 //! gets to its consumers.
 
-use schema::datagram::{Announce, Arrival, Head, MTU_ETHERNET, Packed, Standing};
-use schema::{Failure, Header, State, Status, Topic, Wake, Zones};
+use scanhub_schema::datagram::{Announce, Arrival, Head, MTU_ETHERNET, Packed, Standing};
+use scanhub_schema::{Failure, Header, State, Status, Topic, Wake, Zones};
 
 use super::store::SensorTopics;
 use super::stream::{Placed, Stream};
@@ -216,7 +216,7 @@ fn stamped(header: Header, now: Stamp) -> Header {
 mod tests {
     use super::*;
 
-    use schema::datagram::{Datagram, HEAD};
+    use scanhub_schema::datagram::{Datagram, HEAD};
 
     /// What was said of a sensor's status: the state, and its stamps in ms.
     #[derive(Default)]

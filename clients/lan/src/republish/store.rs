@@ -1,6 +1,6 @@
 //! Where topics of remote sensors are made: shared memory, or a model of it. Refuses to know when something is published.
 
-use schema::{Failure, Header, Topic, Wake};
+use scanhub_schema::{Failure, Header, Topic, Wake};
 
 /// A place for the topics of sensors.
 pub trait TopicStore {
@@ -11,7 +11,7 @@ pub trait TopicStore {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if there is not.
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is not.
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure>;
 
     /// Returns whether the memory that remote sensors may use has room for `topics` of one more sensor.
@@ -24,7 +24,7 @@ pub trait TopicStore {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are short, or as the place says.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or as the place says.
     fn sensor(&self, name: &str) -> Result<Self::Sensor, Failure>;
 
     /// Removes what dead consumers left.
@@ -37,7 +37,7 @@ pub trait SensorTopics {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](schema::Kind) if memory or descriptors are short, or as the place says.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or as the place says.
     fn add(&mut self, topic: Topic) -> Result<(), Failure>;
 
     /// Takes `topic` away.

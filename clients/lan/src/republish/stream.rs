@@ -2,7 +2,7 @@
 //! over lives of the gateway, and begin again with each life of the hub, as a hub's own do. Refuses to know what is in a
 //! sample, and where it is published.
 
-use schema::Header;
+use scanhub_schema::Header;
 
 use super::arrivals::Arrivals;
 use crate::incoming::Remote;

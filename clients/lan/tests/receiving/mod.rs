@@ -3,14 +3,14 @@
 
 use std::collections::VecDeque;
 
-use lan::Stamp;
-use lan::incoming::{Arrived, Incoming};
-use lan::republish::Republisher;
 use scanhub_client::Robot;
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::ZonesState;
-use schema::datagram::Packed;
-use schema::{Header, Topic, Verdict, Zones};
+use scanhub_lan::Stamp;
+use scanhub_lan::incoming::{Arrived, Incoming};
+use scanhub_lan::republish::Republisher;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Header, Topic, Verdict, Zones};
 
 use crate::network::Nanos;
 use crate::remote_topics::{self, Memory};

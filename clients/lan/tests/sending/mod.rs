@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::num::NonZeroU64;
 
 use fastrand::Rng;
-use lan::Stamp;
-use lan::outgoing::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::ZonesState;
-use schema::datagram::Datagram;
-use schema::{Header, Status, Topic, Verdict, Zones};
+use scanhub_lan::Stamp;
+use scanhub_lan::outgoing::{Form, Outgoing, PayloadRef, Sample, Transmit};
+use scanhub_schema::datagram::Datagram;
+use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::network::{Nanos, Network};
 

@@ -5,12 +5,12 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::{Scan, ScanHead};
-use sim::mount::{Mount as Motor, Report};
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
-use tilt::{Angle, Counts, Mount, Point, Settings, Sweep, Tilting};
+use scanhub_schema::{Scan, ScanHead};
+use scanhub_sim::mount::{Mount as Motor, Report};
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
+use scanhub_tilt::{Angle, Counts, Mount, Point, Settings, Sweep, Tilting};
 
 /// A scan of 361 beams takes two turns of the mirror, and so long to arrive.
 const SCAN_NS: u64 = 26_640_000;

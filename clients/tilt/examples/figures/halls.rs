@@ -4,7 +4,7 @@
 use std::fmt::Write;
 
 use fastrand::Rng;
-use sim::world::World;
+use scanhub_sim::world::World;
 
 /// Returns a hall in which nothing changes.
 pub(crate) fn unchanging(seed: u64) -> World {

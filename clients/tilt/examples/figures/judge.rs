@@ -1,7 +1,7 @@
 //! How right the classes of points are, and where obstacles are found. Refuses to know how a hall is played.
 
-use sim::room::BeamTarget;
-use tilt::{Obstacle, PointClass, Settings, Sweep};
+use scanhub_sim::room::BeamTarget;
+use scanhub_tilt::{Obstacle, PointClass, Settings, Sweep};
 
 use super::hall::Hall;
 

@@ -12,14 +12,14 @@ use std::ops::Range;
 
 use hall::Hall;
 use judge::{Score, Seen, Things, seconds, share};
-use sim::mount::{Fault, FaultKind};
-use sim::world::World;
-use tilt::{Settings, Withheld};
+use scanhub_sim::mount::{Fault, FaultKind};
+use scanhub_sim::world::World;
+use scanhub_tilt::{Settings, Withheld};
 
 /// So many halls.
 const SEEDS: u64 = 10;
 
-fn main() -> Result<(), schema::Failure> {
+fn main() -> Result<(), scanhub_schema::Failure> {
     let world: World = "tilt".parse()?;
     let part = std::env::args().nth(1);
     // The caller can choose halls that the library was not tuned on.

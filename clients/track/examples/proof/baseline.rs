@@ -1,9 +1,9 @@
 //! The simplest that one might do: each segment is a person, and belongs to the nearest one within half a metre.
 
-use schema::Foreground;
-use schema::TrackState;
-use track::geometry::{Point, distance};
-use track::{PICTURE_NS, Picture, Site, Track};
+use scanhub_schema::Foreground;
+use scanhub_schema::TrackState;
+use scanhub_track::geometry::{Point, distance};
+use scanhub_track::{PICTURE_NS, Picture, Site, Track};
 
 struct One {
     id: u64,

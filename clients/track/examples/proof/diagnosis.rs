@@ -3,9 +3,9 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use schema::TrackState;
-use track::geometry::{Point, distance};
-use track::{Picture, Track};
+use scanhub_schema::TrackState;
+use scanhub_track::geometry::{Point, distance};
+use scanhub_track::{Picture, Track};
 
 use crate::house::CHAIRS;
 use crate::walkers::{CORRIDOR, Crossing};

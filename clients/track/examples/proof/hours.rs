@@ -3,10 +3,10 @@
 
 use std::time::Instant;
 
-use preprocess::background::{Model, Settings};
-use preprocess::segments::Segmenter;
-use schema::{Foreground, Pose, Scan};
-use track::{People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Pose, Scan};
+use scanhub_track::{People, Picture, Site};
 
 use crate::house::{BEAMS, Eye, House};
 use crate::walkers::Crowd;

@@ -4,12 +4,12 @@
 use std::f64::consts::PI;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::{Nanos, Scan, ScanHead};
-use sim::Shape;
-use sim::beam::NoiseModel;
-use sim::room::Room;
-use sim::world::World;
-use track::geometry::Point;
+use scanhub_schema::{Nanos, Scan, ScanHead};
+use scanhub_sim::Shape;
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
+use scanhub_track::geometry::Point;
 
 /// Sensors, rooms and inner doors.
 const ROOMS: &str = r#"
@@ -108,7 +108,7 @@ impl House {
     fn world(self) -> World {
         let mut text = String::new();
         let mm = |[x, y]: Point| format!("[{:.0}, {:.0}]", 1000.0 * x, 1000.0 * y);
-        for sensor in track::Site::parse("house.toml", ROOMS).expect("the house is right").sensors {
+        for sensor in scanhub_track::Site::parse("house.toml", ROOMS).expect("the house is right").sensors {
             let [x, y] = sensor.place.map(|m| 1000.0 * m);
             text += &format!("[[sensor]]\npose = [{x:.0}, {y:.0}, {:.3}]\n", sensor.yaw_rad.to_degrees());
         }

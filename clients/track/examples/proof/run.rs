@@ -3,13 +3,13 @@
 use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
 
-use preprocess::background::{Model, Settings};
-use preprocess::segments::Segmenter;
-use schema::TrackState;
-use schema::{Foreground, Nanos, Pose, Scan};
-use sim::Shape;
-use track::geometry::{Point, distance, distance_to_border};
-use track::{Kind, People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::TrackState;
+use scanhub_schema::{Foreground, Nanos, Pose, Scan};
+use scanhub_sim::Shape;
+use scanhub_track::geometry::{Point, distance, distance_to_border};
+use scanhub_track::{Kind, People, Picture, Site};
 
 use crate::baseline::Nearest;
 use crate::diagnosis::Diagnosis;

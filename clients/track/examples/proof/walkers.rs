@@ -1,8 +1,8 @@
 //! People of the proof: they walk from place to place, stand, sit down, stop on the way, give way to each other, change rooms
 //! through the corridor, leave the house and come in. A pure function of the seed.
 
-use sim::Shape;
-use track::geometry::{Point, distance};
+use scanhub_sim::Shape;
+use scanhub_track::geometry::{Point, distance};
 
 use crate::house::{CHAIRS, House, chair_legs, normal, post, wall};
 

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use schema::{Failure, check_followed};
+use scanhub_schema::{Failure, check_followed};
 use toml::Spanned;
 
 use super::file::{DoorEntry, File, GapEntry, IgnoreEntry, RoomEntry, SensorEntry, Source, nearest};

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use schema::Printable;
+use scanhub_schema::Printable;
 
 use super::Site;
 use crate::geometry::{Point, middle};

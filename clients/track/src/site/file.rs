@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use scanhub_files::regular;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -110,9 +110,9 @@ impl Site {
     ///     name = "hall"
     ///     polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
     /// "#;
-    /// let site = track::Site::parse("hall.toml", text)?;
+    /// let site = scanhub_track::Site::parse("hall.toml", text)?;
     /// assert_eq!(site.room_at([1.0, 1.0]), Some(0));
-    /// # Ok::<(), schema::Failure>(())
+    /// # Ok::<(), scanhub_schema::Failure>(())
     /// ```
     pub fn parse(name: &str, text: &str) -> Result<Site, Failure> {
         let source = Source { name, text };

@@ -4,11 +4,11 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use preprocess::background::{Model, Settings};
-use preprocess::segments::Segmenter;
-use schema::{Foreground, Pose, Scan, ScanHead};
-use track::geometry::{Point, distance};
-use track::{Event, People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
+use scanhub_track::geometry::{Point, distance};
+use scanhub_track::{Event, People, Picture, Site};
 
 /// The hall has 8 m by 6 m, and the lobby behind it 8 m by 4 m. The opening in the wall between them is 1.8 m wide.
 pub(crate) const SITE: &str = r#"

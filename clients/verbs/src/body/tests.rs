@@ -1,7 +1,7 @@
 //! Bodies and people in front of a sensor that sees a wall at five metres, by ranges that are written here.
 
 use super::*;
-use schema::ScanHead;
+use scanhub_schema::ScanHead;
 
 const COUNT: usize = 361;
 const WALL_MM: u16 = 5000;
@@ -185,7 +185,7 @@ fn a_scan_of_impossible_angles_does_no_harm() {
 #[test]
 fn a_head_that_turns_clockwise_has_sectors_from_the_lesser_angle_on() {
     let mut body = Body::new(Pose::default(), 1000.0);
-    let mut scan = Scan::of(ScanHead::turning(schema::Family::Ld, 360), &[WALL_MM; 360]);
+    let mut scan = Scan::of(ScanHead::turning(scanhub_schema::Family::Ld, 360), &[WALL_MM; 360]);
     // A post on the right, and one behind, across 180 degrees.
     scan.arrays().ranges[85..=95].fill(400);
     scan.arrays().ranges[175..=185].fill(400);

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{GRACE, Who};
-use schema::{Failure, Kind, Topic, is_remote};
+use scanhub_schema::{Failure, Kind, Topic, is_remote};
 
 use super::{Run, Sink, Track, brings};
 use crate::names::{TopicName, no_sensor, no_such_topic};
@@ -96,6 +96,6 @@ impl Run<'_> {
     }
 
     fn published(&self) -> Result<Vec<(String, Topic)>, Failure> {
-        self.session.domain().map(shm::published).transpose().map(Option::unwrap_or_default)
+        self.session.domain().map(scanhub_shm::published).transpose().map(Option::unwrap_or_default)
     }
 }

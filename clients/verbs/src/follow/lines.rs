@@ -2,7 +2,7 @@
 //! samples of the run: they count for no bound, and it is no failure if there are none.
 
 use scanhub_client::streams::{Follower, Sample};
-use schema::Status;
+use scanhub_schema::Status;
 
 use super::{Run, Sink};
 use crate::line::{Line, Loss};

@@ -1,6 +1,6 @@
 //! What is told of a stream beside its samples, in JSON or for people. Refuses to know how it was noticed.
 
-use schema::Failure;
+use scanhub_schema::Failure;
 
 use crate::names::TopicName;
 use crate::output::{End, Output};

@@ -2,7 +2,7 @@
 //! who else is followed.
 
 use scanhub_client::streams::Source;
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;

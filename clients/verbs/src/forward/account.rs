@@ -2,8 +2,8 @@
 
 use std::io::Write;
 
-use lan::outgoing::{Outgoing, Row};
-use schema::Topic;
+use scanhub_lan::outgoing::{Outgoing, Row};
+use scanhub_schema::Topic;
 use serde::Serialize;
 
 use super::Life;

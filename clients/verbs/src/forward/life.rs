@@ -7,8 +7,8 @@ use std::io;
 use std::os::unix::fs::{FileExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind};
-use shm::{Directory, StateDirectory};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::{Directory, StateDirectory};
 
 /// One life of a gateway. Nobody else has its number as long as this value is there.
 #[derive(Debug)]

@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU64;
 
-use schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
+use scanhub_schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
 
 use crate::selection::Word;
 

@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use lan::outgoing::{self, PayloadRef};
 use scanhub_client::streams::{Sample, Session, Source};
-use schema::{Failure, Topic};
+use scanhub_lan::outgoing::{self, PayloadRef};
+use scanhub_schema::{Failure, Topic};
 
 use super::Carrier;
 use super::selection::Selection;
@@ -88,7 +88,7 @@ macro_rules! payloads {
     };
 }
 
-schema::for_each_topic!(payloads);
+scanhub_schema::for_each_topic!(payloads);
 
 fn borrowed(sample: &Sample) -> outgoing::Sample<'_> {
     outgoing::Sample { header: sample.header(), missed: sample.missed(), payload: payload(sample) }

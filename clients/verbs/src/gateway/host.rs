@@ -6,7 +6,7 @@ use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::background_task::BackgroundTask;
 

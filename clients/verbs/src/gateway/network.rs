@@ -4,9 +4,9 @@
 use std::num::NonZeroU64;
 use std::sync::atomic::AtomicBool;
 
-use lan::outgoing::{Form, Outgoing, Sample, Transmit};
-use schema::datagram::{HEAD, MTU_ETHERNET, MTU_LEAST, PORT};
-use schema::{Failure, Kind, Topic};
+use scanhub_lan::outgoing::{Form, Outgoing, Sample, Transmit};
+use scanhub_schema::datagram::{HEAD, MTU_ETHERNET, MTU_LEAST, PORT};
+use scanhub_schema::{Failure, Kind, Topic};
 
 use super::udp_destination::UdpDestination;
 use super::uplink::Uplink;

@@ -16,8 +16,8 @@ use rustix::net::sockopt::{
     set_ip_multicast_if_with_ifindex, set_ipv6_mtu_discover, set_socket_recv_buffer_size,
 };
 use rustix::net::{RecvAncillaryBuffer, RecvFlags, recvmsg};
-use schema::datagram::{Announce, GROUPS, PORT};
-use schema::{Failure, Kind};
+use scanhub_schema::datagram::{Announce, GROUPS, PORT};
+use scanhub_schema::{Failure, Kind};
 
 use super::host::Host;
 

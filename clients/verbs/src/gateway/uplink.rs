@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use crate::interface::{Changes, Interface, interfaces, named};
 

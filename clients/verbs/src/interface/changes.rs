@@ -9,7 +9,7 @@ use rustix::net::netlink::SocketAddrNetlink;
 use rustix::net::{
     AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, bind, recv, send, socket_with,
 };
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// Hears what changes.
 pub(crate) struct Changes {

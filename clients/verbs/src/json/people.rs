@@ -1,6 +1,6 @@
 //! The classes of people: where they are, and what happened to them. A contract, like its parent module.
 
-use schema::{Event, Header, Tracks};
+use scanhub_schema::{Event, Header, Tracks};
 use serde::{Serialize, Serializer};
 
 use super::processed::millionths;
@@ -89,7 +89,7 @@ pub(super) fn thousandths(value: f32) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{EventKind, Pose, Track, TrackSensor, TrackState};
+    use scanhub_schema::{EventKind, Pose, Track, TrackSensor, TrackState};
 
     const HEAD: &str = r#""sensor":"house","seq":7,"topic_seq":6,"stamp_ns":5,"wall_ns":4,"boot":"00000000000000ab","quality":"clean","#;
 

@@ -2,7 +2,7 @@
 //! module.
 
 use scanhub_client::{Heard, Robot};
-use schema::{
+use scanhub_schema::{
     Corner, Early, Foreground, Header, Line as StraightLine, Lines, Mark, Marks, Motion, ROBOT, Segment,
     Verdict, Zone, Zones, in_degrees,
 };
@@ -211,7 +211,7 @@ pub(crate) fn foreground<'a>(
         #[serde(flatten)]
         stamp: Stamp<'a>,
         generation: u32,
-        #[serde(serialize_with = "schema::unit_in_mm")]
+        #[serde(serialize_with = "scanhub_schema::unit_in_mm")]
         unit_mm: u32,
         #[serde(serialize_with = "beams")]
         beams: &'a Foreground,

@@ -1,7 +1,7 @@
 //! Exact lines of class `scan`, for a scanner with beams at fixed angles and for one whose points have their own
 //! angles. And the remedy of missing marks in class `status`.
 
-use schema::{Code, Contents, Family, Flags, Header, Pose, Reasons, Scan, ScanHead, Status};
+use scanhub_schema::{Code, Contents, Family, Flags, Header, Pose, Reasons, Scan, ScanHead, Status};
 
 fn header() -> Header {
     Header {

@@ -1,6 +1,6 @@
 //! The classes of mounts, and of what is seen in three dimensions from them. A contract, like its parent module.
 
-use schema::{Cloud, Header, Obstacle, Obstacles, Tilt};
+use scanhub_schema::{Cloud, Header, Obstacle, Obstacles, Tilt};
 use serde::{Serialize, Serializer};
 
 use super::people::thousandths;
@@ -137,7 +137,7 @@ fn degrees(angle_rad: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{CloudHead, CloudPoint};
+    use scanhub_schema::{CloudHead, CloudPoint};
 
     const HEAD: &str = r#""sensor":"room","seq":7,"topic_seq":6,"stamp_ns":5,"wall_ns":4,"boot":"00000000000000ab","quality":"clean","#;
 

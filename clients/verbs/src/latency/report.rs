@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use scanhub_client::Wait;
-use schema::Flags;
+use scanhub_schema::Flags;
 use serde::Serialize;
 
 use super::ages::Quantiles;
@@ -198,7 +198,7 @@ fn time(ns: u64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use schema::Header;
+    use scanhub_schema::Header;
 
     use super::*;
     use crate::latency::spans::Seen;

@@ -1,7 +1,7 @@
 //! Divides the age of a sample, as far as its stamps allow: time on the line, in the hub, on the way to the consumer,
 //! on another machine. Time is an argument; refuses to know how samples arrive and how the result is shown.
 
-use schema::{Flags, Header};
+use scanhub_schema::{Flags, Header};
 
 use super::ages::Ages;
 

@@ -7,7 +7,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// How often a light that cannot be switched is tried again.
 const AGAIN: Duration = Duration::from_secs(1);

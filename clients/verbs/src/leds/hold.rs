@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::Verdict;
+use scanhub_schema::Verdict;
 
 /// A verdict, and the sensor that it is of, where there are several.
 pub(crate) type Said = (Verdict, Option<String>);

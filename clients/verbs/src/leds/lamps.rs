@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use schema::Verdict;
+use scanhub_schema::Verdict;
 
 /// A light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

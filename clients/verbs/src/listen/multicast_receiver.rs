@@ -13,8 +13,8 @@ use nix::sys::socket::{ControlMessageOwned, MsgFlags, SockaddrIn, recvmsg, setso
 use nix::sys::time::TimeSpec;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_client::clock;
-use schema::datagram::{GROUPS, PORT};
-use schema::{Failure, Kind};
+use scanhub_schema::datagram::{GROUPS, PORT};
+use scanhub_schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 
 use crate::interface::{Changes, Interface, interfaces, named};

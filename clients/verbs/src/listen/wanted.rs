@@ -1,7 +1,7 @@
 //! Which topics are wanted, and the groups that they come by. Refuses to know who sends them.
 
-use schema::datagram::{Announce, group};
-use schema::{Failure, Kind, Topic};
+use scanhub_schema::datagram::{Announce, group};
+use scanhub_schema::{Failure, Kind, Topic};
 
 /// The topics called so; all if none is.
 pub(super) fn topics(names: &[String]) -> Result<Vec<Topic>, Failure> {

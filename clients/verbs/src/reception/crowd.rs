@@ -3,8 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-use lan::republish::SENSORS;
-use schema::datagram::{LIVES, ROWS};
+use scanhub_lan::republish::SENSORS;
+use scanhub_schema::datagram::{LIVES, ROWS};
 
 /// How often there was no room, since the begin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

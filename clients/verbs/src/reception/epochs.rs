@@ -4,10 +4,10 @@
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-use lan::Key;
-use lan::incoming::GATEWAYS;
-use schema::Failure;
-use shm::StateDirectory;
+use scanhub_lan::Key;
+use scanhub_lan::incoming::GATEWAYS;
+use scanhub_schema::Failure;
+use scanhub_shm::StateDirectory;
 
 /// The file in which they are kept; nothing where there is no place for one.
 pub(super) struct Epochs {

@@ -1,7 +1,7 @@
 //! What gateways are called here: by their number, or by the name that the user gives one; and which of them are wanted.
 
-use schema::datagram::Datagram;
-use schema::{Failure, Kind, check_sensor};
+use scanhub_schema::datagram::Datagram;
+use scanhub_schema::{Failure, Kind, check_sensor};
 
 /// Names that the user gave.
 #[derive(Default)]
@@ -81,7 +81,7 @@ const HUB_NAMES: &str = "1 to 24 of a-z, 0-9, _ and -, but not robot";
 mod tests {
     use super::*;
 
-    use schema::datagram::{HEAD, Head};
+    use scanhub_schema::datagram::{HEAD, Head};
 
     #[test]
     fn hubs_are_wanted_by_number_and_by_name() {

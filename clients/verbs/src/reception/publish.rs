@@ -5,12 +5,12 @@ mod budget;
 
 use std::rc::Rc;
 
-use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
-use schema::limits::TopicLimits;
-use schema::{BEAMS, Contents, Failure, Header, Kind, Telegram, Topic, Wake};
-use shm::Domain;
-use shm::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
+use scanhub_lan::republish::{Republisher, SensorTopics, TopicStore};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{BEAMS, Contents, Failure, Header, Kind, Telegram, Topic, Wake};
+use scanhub_shm::Domain;
+use scanhub_shm::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
 
 use any_publisher::AnyPublisher;
 use budget::{Budget, Share};

@@ -1,6 +1,6 @@
 //! Which topics a receiver takes: those of all sensors, whole. Refuses to know who sends them.
 
-use schema::{Failure, Kind, Topic};
+use scanhub_schema::{Failure, Kind, Topic};
 
 use crate::selection::Word;
 

@@ -2,16 +2,16 @@
 
 use std::io::{self, Write};
 
-use lan::incoming::Remote;
-use schema::datagram::Head;
-use schema::{Header, Topic};
+use scanhub_lan::incoming::Remote;
+use scanhub_schema::datagram::Head;
+use scanhub_schema::{Header, Topic};
 use serde::{Serialize, Serializer};
 
 use crate::json;
 use crate::output::{End, Output};
 use crate::show::{Keys, Show};
 
-/// A line of JSON; `sensor` is called so by [`PeerTable::name`](lan::incoming::PeerTable::name).
+/// A line of JSON; `sensor` is called so by [`PeerTable::name`](scanhub_lan::incoming::PeerTable::name).
 pub(super) fn json(remote: &Remote<'_>, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
     // The flags come behind all that there is of a sample here.
     let header = Header { flags: 0, ..remote.header(std::process::id()) };
@@ -39,14 +39,14 @@ macro_rules! payloads {
         fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
             match remote.topic {
                 $(Topic::$topic => remote
-                    .payload::<schema::payload_type!($payload)>()
+                    .payload::<scanhub_schema::payload_type!($payload)>()
                     .map_or(Ok(()), |payload| how.show(&*payload)),)*
             }
         }
     };
 }
 
-schema::for_each_topic!(payloads);
+scanhub_schema::for_each_topic!(payloads);
 
 /// What becomes of a payload.
 trait Way<E> {

@@ -5,12 +5,12 @@ mod classes;
 
 use std::io::Write;
 
-use lan::incoming::{PeerTable, Remote};
-use schema::Topic;
-use schema::datagram::{Announce, DatagramError, Head, Row, StreamStats};
+use scanhub_lan::incoming::{PeerTable, Remote};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, DatagramError, Head, Row, StreamStats};
+use scanhub_shm::Domain;
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
-use shm::Domain;
 
 use super::names::Names;
 use super::publish::Publication;

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use schema::Topic;
+use scanhub_schema::Topic;
 
 use super::Kept;
 use super::files::{Files, Split, discard};
@@ -305,8 +305,8 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 mod tests {
     use std::fs;
 
-    use schema::file::Compression;
-    use schema::{Header, Status};
+    use scanhub_schema::file::Compression;
+    use scanhub_schema::{Header, Status};
     use tempfile::TempDir;
 
     use super::super::part::Form;
@@ -326,7 +326,7 @@ mod tests {
     }
 
     fn push(disk: &Disk, track: usize) {
-        let pack = |room: &mut [u8]| schema::datagram::Packed::pack(&Status::default(), room);
+        let pack = |room: &mut [u8]| scanhub_schema::datagram::Packed::pack(&Status::default(), room);
         let pushed = disk.queue.push(track, &Header::default(), size_of::<Status>(), pack);
         assert!(pushed);
     }

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use rustix::fs::OFlags;
 use scanhub_files::output::Target;
-use schema::file::MAGIC;
+use scanhub_schema::file::MAGIC;
 
 use super::lock;
 use crate::duration;

@@ -3,7 +3,7 @@
 use std::io::{self, ErrorKind};
 use std::path::Path;
 
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 /// What kind of failure it is that `error` comes of a write: of a disk that is full, or may not be filled any further,
 /// there may be more later.

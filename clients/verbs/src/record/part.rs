@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use ros::bag::{self, Bag};
-use schema::datagram::Packed;
-use schema::file::{Compression, Writer};
-use schema::{Header, Scan, Status, Topic};
+use scanhub_ros::bag::{self, Bag};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{Compression, Writer};
+use scanhub_schema::{Header, Scan, Status, Topic};
 
 use super::Kept;
 use super::queue::{Batch, Entry, Gap};
@@ -307,7 +307,7 @@ const INDEX_OF_CHANNEL: usize = 24;
 const END_OF_CHUNK: u64 = 70;
 const END_OF_CHANNEL: u64 = 10;
 const END_OF_TRACK: u64 = 100;
-const END_OF_TOPIC: u64 = 100 + schema::file::LAYOUT.len() as u64;
+const END_OF_TOPIC: u64 = 100 + scanhub_schema::file::LAYOUT.len() as u64;
 /// Name of the metadata record of a life of the hub, before its first sample.
 const LIFE: &str = "scanhub.life";
 /// Name of the metadata record of samples that were left out.

@@ -5,7 +5,7 @@
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use schema::Header;
+use scanhub_schema::Header;
 
 use crate::names::TopicName;
 

@@ -1,6 +1,6 @@
 //! Which topics are recorded: named ones, and topics of all sensors. Refuses to know which sensors there are.
 
-use schema::{Failure, Kind, Topic};
+use scanhub_schema::{Failure, Kind, Topic};
 
 use crate::names::TopicName;
 use crate::selection;

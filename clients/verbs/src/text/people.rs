@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use schema::{Event, EventKind, Header, Tracks};
+use scanhub_schema::{Event, EventKind, Header, Tracks};
 
 use super::numbers;
 

@@ -3,7 +3,9 @@
 use std::io::{self, Write};
 
 use scanhub_client::{Heard, Robot};
-use schema::{Background, BackgroundHead, Early, Flags, Foreground, Header, Lines, Marks, Motion, Verdict};
+use scanhub_schema::{
+    Background, BackgroundHead, Early, Flags, Foreground, Header, Lines, Marks, Motion, Verdict,
+};
 
 use super::numbers;
 
@@ -150,7 +152,7 @@ pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Zones;
+    use scanhub_schema::Zones;
 
     #[test]
     fn what_is_not_known_is_not_called_far() {
@@ -171,17 +173,18 @@ mod tests {
     #[test]
     fn a_segment_without_support_says_so() {
         let mut found = Foreground::of(3);
-        let head = schema::ForegroundHead {
+        let head = scanhub_schema::ForegroundHead {
             unit_um: 10_000,
             count: 3,
             beams: 3,
             segments: 2,
             supported: 1,
-            ..schema::ForegroundHead::default()
+            ..scanhub_schema::ForegroundHead::default()
         };
         let segments = found.begin(head).segments;
-        segments[0] = schema::Segment { first: 0, last: 1, width: 7, x_mm: 900, y_mm: -4, ..segments[0] };
-        segments[1] = schema::Segment { first: 2, last: 2, x_mm: 8, ..segments[1] };
+        segments[0] =
+            scanhub_schema::Segment { first: 0, last: 1, width: 7, x_mm: 900, y_mm: -4, ..segments[0] };
+        segments[1] = scanhub_schema::Segment { first: 2, last: 2, x_mm: 8, ..segments[1] };
         let mut line = Vec::new();
         foreground(&mut line, &Header::default(), &found).unwrap();
         let line = String::from_utf8(line).unwrap();

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use schema::{Cloud, Header, Obstacle, Obstacles, PointClass, Tilt};
+use scanhub_schema::{Cloud, Header, Obstacle, Obstacles, PointClass, Tilt};
 
 use super::numbers;
 

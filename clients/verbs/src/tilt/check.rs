@@ -2,8 +2,8 @@
 
 use std::io::{self, Write};
 
-use ::tilt::{Check, Mount};
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
+use scanhub_tilt::{Check, Mount};
 use serde::Serialize;
 
 use crate::output::{End, Output};

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use ::tilt::{Counts, Withheld};
+use scanhub_tilt::{Counts, Withheld};
 use serde::Serialize;
 
 /// Class `angles`.

@@ -3,12 +3,12 @@
 
 use std::hash::{BuildHasher, RandomState};
 
-use ::tilt::{Point, Sweep};
 use scanhub_client::streams::find;
 use scanhub_client::{Publication, PublishSession, SensorPublisher};
-use schema::limits::TopicLimits;
-use schema::{Cloud, CloudHead, CloudPoint, Failure, Flags, Header, Maker, Obstacles, Wake};
-use shm::Domain;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Cloud, CloudHead, CloudPoint, Failure, Flags, Header, Maker, Obstacles, Wake};
+use scanhub_shm::Domain;
+use scanhub_tilt::{Point, Sweep};
 
 use crate::names::position;
 
@@ -47,8 +47,8 @@ impl Samples {
 
     /// Makes the topics of `name` in the domain where a hub or listener lives, for clouds of so many `beams`.
     ///
-    /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible,
-    /// [`Kind::NameHeld`](schema::Kind) if another process has it, [`Kind::Short`](schema::Kind) if memory or descriptors are
+    /// [`Kind::NoHub`](scanhub_schema::Kind) if none does, [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible,
+    /// [`Kind::NameHeld`](scanhub_schema::Kind) if another process has it, [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are
     /// short.
     pub(super) fn publish(&mut self, name: &str, beams: usize, places: &[Domain]) -> Result<(), Failure> {
         let limits = TopicLimits { beams, ..TopicLimits::default() };

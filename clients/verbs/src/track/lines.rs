@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::time::Duration;
 
-use ::track::Counts;
+use scanhub_track::Counts;
 use serde::Serialize;
 
 /// Class `count`.

@@ -3,12 +3,12 @@
 
 use std::hash::{BuildHasher, RandomState};
 
-use ::track::{PICTURE_NS, Picture, Site};
 use scanhub_client::streams::find;
 use scanhub_client::{Publication, PublishSession, SensorPublisher, clock};
-use schema::limits::TopicLimits;
-use schema::{Event, Failure, Flags, Header, Maker, Tracks, Wake};
-use shm::Domain;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Event, Failure, Flags, Header, Maker, Tracks, Wake};
+use scanhub_shm::Domain;
+use scanhub_track::{PICTURE_NS, Picture, Site};
 
 use crate::names::position;
 
@@ -48,8 +48,8 @@ impl Samples {
 
     /// Makes the topics of `name` in the domain where a hub or listener lives.
     ///
-    /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible,
-    /// [`Kind::NameHeld`](schema::Kind) if another process has it, [`Kind::Short`](schema::Kind) if memory or descriptors are short.
+    /// [`Kind::NoHub`](scanhub_schema::Kind) if none does, [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible,
+    /// [`Kind::NameHeld`](scanhub_schema::Kind) if another process has it, [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short.
     pub(super) fn publish(&mut self, name: &str, places: &[Domain]) -> Result<(), Failure> {
         let (topics, limits) = (Maker::Tracker.topics(), TopicLimits::default());
         let sensor = PublishSession::beside(&find(places)?, name, topics, limits)?;

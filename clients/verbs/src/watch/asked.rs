@@ -1,11 +1,13 @@
 //! What a person asks the terminal's picture for: counters, a place, lines, and what colours and trails say.
 
 use ratatui::style::Color;
-use schema::{Contents, Corner, Foreground, ForegroundHead, Header, Line, Lines, Scan, ScanHead, Status};
+use scanhub_schema::{
+    Contents, Corner, Foreground, ForegroundHead, Header, Line, Lines, Scan, ScanHead, Status,
+};
 
 use super::golden::{scene, screen, text};
 use super::view::View;
-use scene::Scene;
+use scanhub_scene::Scene;
 
 /// Counters, what is pointed at, lines, trails and intensities.
 #[test]

@@ -3,9 +3,9 @@
 use ratatui::layout::Rect;
 use ratatui::style::Modifier;
 use ratatui::text::Line;
-use schema::{Counter, Status};
+use scanhub_schema::{Counter, Status};
 
-use scene::Sensor;
+use scanhub_scene::Sensor;
 
 /// The page for `area`: a heading, the shares of the line, and all counters; as many columns and rows as there is room for.
 pub(super) fn page(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {

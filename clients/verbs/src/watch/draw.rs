@@ -7,12 +7,12 @@ use ratatui::style::{Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Paragraph};
 
-use schema::Counter;
+use scanhub_schema::Counter;
 
 use super::counters::page;
 use super::map::{DOTS, colour, map};
 use super::view::View;
-use scene::{Place, Scene, Sensor, rooms, verdict};
+use scanhub_scene::{Place, Scene, Sensor, rooms, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {

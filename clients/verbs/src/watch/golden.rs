@@ -9,14 +9,14 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
-use schema::{
+use scanhub_schema::{
     Background, BackgroundHead, Counter, Foreground, ForegroundHead, Header, Mark, Marks, Pose, Scan,
     ScanHead, Segment, State, Status, Track, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 use super::draw::{draw, place_of_map};
 use super::view::View;
-use scene::{Scene, Sensor};
+use scanhub_scene::{Scene, Sensor};
 
 /// The room, without people: metres ahead and to the left of the robot.
 const WALLS: [f64; 4] = [4.2, -3.4, 3.0, -3.6];

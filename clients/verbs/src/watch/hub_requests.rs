@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
 use scanhub_client::request;
-use schema::{Background, Failure, Request, Verb};
-use shm::Domain;
+use scanhub_schema::{Background, Failure, Request, Verb};
+use scanhub_shm::Domain;
 
 /// At most one order at a time.
 #[derive(Default)]

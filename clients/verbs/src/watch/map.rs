@@ -9,10 +9,10 @@ use ratatui::symbols::Marker;
 use ratatui::text::Line;
 use ratatui::widgets::canvas::{Canvas, Context, Points};
 
-use schema::Verdict;
+use scanhub_schema::Verdict;
 
 use super::view::View;
-use scene::{Scene, circles};
+use scanhub_scene::{Scene, circles};
 
 /// Dots of a cell of the terminal.
 pub(crate) const DOTS: (f64, f64) = (2.0, 4.0);
@@ -265,7 +265,7 @@ fn turned((x, y): (f64, f64)) -> (f64, f64) {
 }
 
 /// `line` from end to end, dot by dot.
-fn dots_of(line: &schema::Line, dot_m: f64) -> Dots {
+fn dots_of(line: &scanhub_schema::Line, dot_m: f64) -> Dots {
     let [x1, y1, x2, y2] = [line.x1_m, line.y1_m, line.x2_m, line.y2_m].map(f64::from);
     let steps = ((x2 - x1).hypot(y2 - y1) / dot_m).ceil().clamp(1.0, 2000.0);
     let at = |n: u32| (x1 + (x2 - x1) * f64::from(n) / steps, y1 + (y2 - y1) * f64::from(n) / steps);
@@ -273,7 +273,7 @@ fn dots_of(line: &schema::Line, dot_m: f64) -> Dots {
 }
 
 /// `circle` as a dotted line, from the top on.
-fn dotted(circle: &scene::Circle, dot_m: f64) -> Circle {
+fn dotted(circle: &scanhub_scene::Circle, dot_m: f64) -> Circle {
     let radius = circle.radius_m;
     let points = (radius / dot_m * std::f64::consts::TAU / CIRCLE_DOTS).clamp(8.0, 360.0) as u32;
     let at = |n: u32| f64::from(n) * std::f64::consts::TAU / f64::from(points);

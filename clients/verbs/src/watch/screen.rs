@@ -19,7 +19,7 @@ use ratatui::{Frame, Terminal};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::tcgetwinsize;
-use schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind};
 
 use super::keys::{Key, Keys, MOUSE_OFF, MOUSE_ON};
 use crate::output::End;

@@ -5,7 +5,7 @@ use ratatui::layout::{Position, Rect};
 
 use super::keys::Key;
 use super::map::DOTS;
-use scene::{Scene, Sensor};
+use scanhub_scene::{Scene, Sensor};
 
 /// What is shown.
 #[derive(Clone, Debug)]
@@ -246,7 +246,7 @@ const OUTLIERS: usize = 50;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{Header, Scan, ScanHead, Status};
+    use scanhub_schema::{Header, Scan, ScanHead, Status};
 
     fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
         keys.chars().map(|key| view.key(Key::Sign(key), scene)).last().flatten()

@@ -3,12 +3,12 @@
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
-use scene::{Circle, People, Scene, Trouble, circles};
-use schema::{Failure, Kind, Maker, Topic, Verdict};
-use shm::Domain;
+use scanhub_scene::{Circle, People, Scene, Trouble, circles};
+use scanhub_schema::{Failure, Kind, Maker, Topic, Verdict};
+use scanhub_shm::Domain;
+use scanhub_web::{Board, ChannelId, Event, Playback, Progress, messages};
 
 use super::sensor::Channels;
 use super::tilted::Tilted;
@@ -140,7 +140,8 @@ impl<'a> Feeder<'a> {
     /// What was true a moment ago, and is not any more.
     fn clear(&mut self) {
         for channels in &self.channels {
-            let is_old = |sensor: &scene::Sensor| sensor.name == channels.sensor && sensor.scan.is_none();
+            let is_old =
+                |sensor: &scanhub_scene::Sensor| sensor.name == channels.sensor && sensor.scan.is_none();
             if self.scene.sensors.iter().any(is_old) {
                 channels.clear(self.board);
             }
@@ -197,7 +198,7 @@ impl<'a> Feeder<'a> {
         if !self.board.is_watched(self.robot) {
             return;
         }
-        let (verdict, whose, _) = scene::verdict(self.scene.robot().map(|(_, sensor)| sensor));
+        let (verdict, whose, _) = scanhub_scene::verdict(self.scene.robot().map(|(_, sensor)| sensor));
         let told = (verdict, whose.map(str::to_owned), self.scene.hub_lives);
         if now >= self.robot_at || told != self.told {
             let domain = self.options.places.first().map(Domain::name).unwrap_or_default();

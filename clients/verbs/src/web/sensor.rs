@@ -1,7 +1,7 @@
 //! The channels of one sensor: its scans, what stands before its background, and that. Refuses to know when a sample comes.
 
-use ::web::{Board, ChannelId, messages};
-use schema::{Background, Header, Scan};
+use scanhub_schema::{Background, Header, Scan};
+use scanhub_web::{Board, ChannelId, messages};
 
 /// What a sensor is told in.
 pub(super) struct Channels {
@@ -33,7 +33,7 @@ impl Channels {
         self.scan_of = Some(*header);
         if board.is_wanted(self.scan) {
             message.clear();
-            ros::laser_scan(message, ros::frame(&self.sensor), header, scan);
+            scanhub_ros::laser_scan(message, scanhub_ros::frame(&self.sensor), header, scan);
             board.put(self.scan, header.wall_ns, message);
         }
     }
@@ -44,7 +44,12 @@ impl Channels {
     }
 
     /// Puts up the foreground of `seen` as soon as the scan of the same telegram is here, which says where its beams point.
-    pub(super) fn put_foreground(&mut self, board: &Board, message: &mut Vec<u8>, seen: &scene::Sensor) {
+    pub(super) fn put_foreground(
+        &mut self,
+        board: &Board,
+        message: &mut Vec<u8>,
+        seen: &scanhub_scene::Sensor,
+    ) {
         let Some(header) = self.scan_of.filter(|header| self.foreground_of == Some(header.seq)) else {
             return;
         };
@@ -52,7 +57,13 @@ impl Channels {
         let (Some(scan), Some(foreground)) = (&seen.scan, &seen.foreground) else { return };
         if board.is_wanted(self.foreground) {
             message.clear();
-            ros::foreground_cloud(message, ros::frame(&self.sensor), &header, scan, foreground);
+            scanhub_ros::foreground_cloud(
+                message,
+                scanhub_ros::frame(&self.sensor),
+                &header,
+                scan,
+                foreground,
+            );
             board.put(self.foreground, header.wall_ns, message);
         }
     }

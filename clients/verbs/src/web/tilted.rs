@@ -1,9 +1,9 @@
 //! What mounts say and what programs like `tilt` make of it, as channels. Angles and points are followed only while a viewer
 //! asks for them. Refuses to know sensors.
 
-use ::web::{Board, ChannelId, messages};
 use scanhub_client::streams::Sample;
-use schema::{Maker, SweepPoints, Topic};
+use scanhub_schema::{Maker, SweepPoints, Topic};
+use scanhub_web::{Board, ChannelId, messages};
 
 use crate::names::TopicName;
 
@@ -83,7 +83,7 @@ impl<'a> Tilted<'a> {
                     && board.is_wanted(sweeps.cloud)
                 {
                     message.clear();
-                    ros::sweep_cloud(&mut message, cloud.header(), points);
+                    scanhub_ros::sweep_cloud(&mut message, cloud.header(), points);
                     board.put(sweeps.cloud, cloud.header().wall_ns, &message);
                 }
                 self.message = message;

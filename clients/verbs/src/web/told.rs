@@ -2,8 +2,8 @@
 
 use std::io::Write;
 
-use ::web::{Event, Visit};
-use schema::Failure;
+use scanhub_schema::Failure;
+use scanhub_web::{Event, Visit};
 use serde::Serialize;
 
 use super::{WEB_PORT, WebOptions};

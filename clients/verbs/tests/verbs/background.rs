@@ -9,10 +9,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crate::fake::Place;
-use schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb};
-use shm::ControlServer;
-use shm::{Domain, HubLock};
-use verbs::{BackgroundOptions, ModelOrder, background, saved_model};
+use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb};
+use scanhub_shm::ControlServer;
+use scanhub_shm::{Domain, HubLock};
+use scanhub_verbs::{BackgroundOptions, ModelOrder, background, saved_model};
 
 /// A hub that answers for the background of `front`.
 struct Keeper {
@@ -27,7 +27,7 @@ impl Keeper {
         let flag = stop.clone();
         let (ready, is_ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let server = ControlServer::create(&shm::hub_node(&domain).unwrap()).unwrap();
+            let server = ControlServer::create(&scanhub_shm::hub_node(&domain).unwrap()).unwrap();
             lock.report_ready().unwrap();
             ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
@@ -43,7 +43,7 @@ impl Keeper {
                     };
                     server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
                 }
-                shm::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
+                scanhub_shm::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }
         });
         is_ready.recv().unwrap();

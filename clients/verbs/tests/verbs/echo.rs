@@ -5,9 +5,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
-use schema::csv::ScanColumns;
-use schema::{Counter, Flags, Kind, Verdict};
-use verbs::{Bounds, EchoOptions, Format, echo};
+use scanhub_schema::csv::ScanColumns;
+use scanhub_schema::{Counter, Flags, Kind, Verdict};
+use scanhub_verbs::{Bounds, EchoOptions, Format, echo};
 
 const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 

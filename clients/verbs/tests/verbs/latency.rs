@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
 use scanhub_client::Wait;
-use schema::{Failure, Kind, Verdict};
-use verbs::{Bounds, LatencyOptions, latency};
+use scanhub_schema::{Failure, Kind, Verdict};
+use scanhub_verbs::{Bounds, LatencyOptions, latency};
 
 fn options(place: &Place, topics: &[&str], count: u64) -> LatencyOptions {
     LatencyOptions {

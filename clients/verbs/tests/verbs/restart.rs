@@ -6,10 +6,10 @@ use std::time::Duration;
 use crate::child::{Child, spawn};
 use crate::fake::{FakeHub, Place, Verb, until};
 use scanhub_client::Subscription;
-use schema::Scan;
-use shm::PortFactory;
-use shm::{Domain, holder};
-use verbs::{Bounds, EchoOptions, Format, echo};
+use scanhub_schema::Scan;
+use scanhub_shm::PortFactory;
+use scanhub_shm::{Domain, holder};
+use scanhub_verbs::{Bounds, EchoOptions, Format, echo};
 
 /// One turn of an LMS's mirror (75 Hz); it measures the half degrees one turn later.
 const TURN_NS: u64 = 13_320_000;
@@ -130,7 +130,7 @@ fn a_client_that_comes_between_two_hubs() {
     let place = Place::new();
     let hub = Hub::start(&place, 1);
     until("a hub", || matches!(holder(place.domain.root()), Ok(Some(1..))));
-    until("its topics", || shm::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
+    until("its topics", || scanhub_shm::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
     hub.kill(&place);
     let timeout = Duration::from_millis(50);
     let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
@@ -153,7 +153,7 @@ fn the_numbers_of_a_network_go_on_over_lives_of_a_hub() {
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     assert!(scans.try_next().unwrap().is_none());
-    hub.front().flags = schema::Flags::REMOTE;
+    hub.front().flags = scanhub_schema::Flags::REMOTE;
     let mut missed = |hub: &mut FakeHub, boot: u64, topic_seq: u64| {
         (hub.front().boot, hub.front().scan.topic_seq) = (boot, topic_seq);
         hub.front().scan(&[1000; 181]);

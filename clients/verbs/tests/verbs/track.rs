@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb, until};
-use ::track::Site;
-use verbs::{Bounds, TrackOptions, track};
+use scanhub_track::Site;
+use scanhub_verbs::{Bounds, TrackOptions, track};
 
 const SITE: &str = r#"
 [[sensor]]

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
-use schema::{Counter, Kind, Pose};
-use verbs::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
+use scanhub_schema::{Counter, Kind, Pose};
+use scanhub_verbs::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
 
 fn start_list(place: &Place, json: bool) -> Verb {
     let options = ListOptions { json, places: place.places() };

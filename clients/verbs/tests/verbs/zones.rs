@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
 use scanhub_client::{RobotFollower, ZonesFollower};
-use schema::{Kind, Verdict};
-use verbs::{Bounds, EchoOptions, Format, HzOptions, echo, hz};
+use scanhub_schema::{Kind, Verdict};
+use scanhub_verbs::{Bounds, EchoOptions, Format, HzOptions, echo, hz};
 
 /// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
 const PERIOD_US: u32 = 300_000;

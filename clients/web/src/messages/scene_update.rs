@@ -3,9 +3,9 @@
 
 mod obstacles;
 
-use ros::BASE_FRAME;
-use scene::{Ellipse, People, Scene, circles};
-use schema::Verdict;
+use scanhub_ros::BASE_FRAME;
+use scanhub_scene::{Ellipse, People, Scene, circles};
+use scanhub_schema::Verdict;
 use serde::Serialize;
 
 use super::{bytes, json};
@@ -32,9 +32,11 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entities.push(entity);
     }
     for (_, sensor) in scene.robot() {
-        let near = |a: &scene::Point, b: &scene::Point| a.distance_m().total_cmp(&b.distance_m());
+        let near =
+            |a: &scanhub_scene::Point, b: &scanhub_scene::Point| a.distance_m().total_cmp(&b.distance_m());
         let inside = around.iter().filter_map(|circle| Some((circle.inside(sensor).min_by(near)?, circle)));
-        let smallest = |a: &scene::Circle, b: &scene::Circle| a.radius_m.total_cmp(&b.radius_m);
+        let smallest =
+            |a: &scanhub_scene::Circle, b: &scanhub_scene::Circle| a.radius_m.total_cmp(&b.radius_m);
         let Some((point, circle)) = inside.min_by(|a, b| smallest(a.1, b.1)) else { continue };
         let mut entity = Entity::new(format!("beam {}", sensor.name), wall_ns);
         entity.tell("sensor", sensor.name.clone());
@@ -75,10 +77,11 @@ pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         let found = sensor.lines()?;
         let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
         entity.tell("sensor", sensor.name.clone());
-        let ends = |line: &schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
+        let ends = |line: &scanhub_schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
         let points = found.lines().iter().flat_map(ends).map(|(x, y)| (x.into(), y.into()));
         entity.lines.push(LinePrimitive::new(LINE_LIST, points, LINE));
-        let corner = |corner: &schema::Corner| ball((corner.x_m.into(), corner.y_m.into()), CORNER_M, LINE);
+        let corner =
+            |corner: &scanhub_schema::Corner| ball((corner.x_m.into(), corner.y_m.into()), CORNER_M, LINE);
         entity.spheres = found.corners().iter().map(corner).collect();
         Some(entity)
     });

@@ -1,6 +1,6 @@
 //! The angle of a mount as an object of JSON. Refuses to know what is mounted on it.
 
-use schema::Tilt;
+use scanhub_schema::Tilt;
 use serde::Serialize;
 
 use super::{beside_scan, bytes, json};

@@ -5,10 +5,10 @@
 //! in the time of the recording. It builds the same scans as the hub that recorded them, with the same times between
 //! them.
 
-use recording::{Frame, VirtualTime};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
-use schema::{Flags, Header, MILLIS, Nanos, State};
+use scanhub_recording::{Frame, VirtualTime};
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::Frames;
 use super::{MAX_GAP, ReplayLink, VALID_UNTIL_NEXT};

@@ -4,10 +4,10 @@
 use std::io::{self, Read};
 use std::path::Path;
 
-use config::Link;
-use recording::{Encoding, Form, Frame, Recording};
+use scanhub_config::Link;
 use scanhub_drivers::{Settings, features};
-use schema::{Failure, Family, Header, Kind, Nanos};
+use scanhub_recording::{Encoding, Form, Frame, Recording};
+use scanhub_schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::MAX_GAP;
 
@@ -413,7 +413,7 @@ const MODE_WITHIN: usize = 500;
 mod tests {
     use super::*;
 
-    const SECOND: Nanos = 1_000 * schema::MILLIS;
+    const SECOND: Nanos = 1_000 * scanhub_schema::MILLIS;
 
     fn frame(wall_s: u64, header: Option<Header>) -> Frame {
         Frame { wall_ns: Some(wall_s * SECOND), header, ..Frame::default() }

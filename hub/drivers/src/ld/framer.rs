@@ -5,7 +5,7 @@
 use crate::line;
 use crate::line::framing::{Verdict, judge};
 use crate::line::{Buffer, Tally, suspect};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::ld::packet::{HEADER, LEN, Packet, Reject};
 

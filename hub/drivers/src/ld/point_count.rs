@@ -1,7 +1,7 @@
 //! Measures how many points a scanner measures per revolution. A head that spins up measures more of them, so only
 //! revolutions at a constant speed count.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::ld::model::Model;
 use crate::ld::packet::{POINTS, Packet};

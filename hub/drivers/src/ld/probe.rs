@@ -1,6 +1,6 @@
 //! Recognizes an LDROBOT by its stream. The search never sends a byte to find one.
 
-use schema::{Family, MILLIS, Nanos};
+use scanhub_schema::{Family, MILLIS, Nanos};
 
 use crate::ld::framer::Framer;
 use crate::ld::model::Model;

@@ -5,7 +5,7 @@
 //! has passed since the last packet. The time of arrival is known only as a range, because bytes may have waited in the host:
 //! a restart counts only if no time in this range fits a clock that continued.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::ld::packet::CLOCK_TURN;
 

@@ -3,7 +3,7 @@
 //! for is not believed where they do not. Counts what was lost between two packets, and dates packets by the scanner's
 //! own clock more finely than by its milliseconds.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::ld::packet::{CLOCK_TURN, POINTS, Packet, TURN};
 

@@ -4,7 +4,7 @@
 
 use core::fmt;
 
-use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
+use scanhub_schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
 use crate::ld::framer::{Framer, Span};
 use crate::ld::model::Model;

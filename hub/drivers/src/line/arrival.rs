@@ -1,6 +1,6 @@
 //! Latest and earliest possible arrival of a byte. A port only reports when a read returned and how many bytes it had.
 
-use schema::{Nanos, line_time};
+use scanhub_schema::{Nanos, line_time};
 
 /// The last reads, newest last, by the number of the byte after their last one.
 #[derive(Clone, Debug, Default)]
@@ -135,7 +135,7 @@ pub(crate) const TTY: usize = 4_095;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::MILLIS;
+    use scanhub_schema::MILLIS;
 
     #[test]
     fn later_bytes_took_their_time() {

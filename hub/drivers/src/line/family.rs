@@ -22,7 +22,7 @@ pub struct Features {
     pub has_whole_telegrams: bool,
     /// Whether the scanner reports its settings on request, outside a session: to an [inquiry](crate::inquiry).
     pub has_inquiry: bool,
-    /// Arrays of a scan: bits of [`schema::Contents`].
+    /// Arrays of a scan: bits of [`scanhub_schema::Contents`].
     pub contents: u8,
     /// Maximum number of bytes of a telegram, or of packets that arrived together.
     pub max_telegram: usize,

@@ -3,7 +3,7 @@
 
 use core::fmt;
 
-use schema::{Family, Nanos};
+use scanhub_schema::{Family, Nanos};
 
 /// Recognizer of a family.
 pub trait Probe: fmt::Debug + Send {

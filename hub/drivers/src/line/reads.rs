@@ -2,7 +2,7 @@
 
 use crate::line::arrival::TTY;
 use crate::line::{Arrivals, Output};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// The reads of one session.
 #[derive(Clone, Debug)]

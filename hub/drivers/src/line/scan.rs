@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 
 use crate::line::grid::{Grid, Point};
 use crate::line::{self, Closed};
-use schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
+use scanhub_schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
 
 /// A scan as it was received.
 #[derive(Clone, Copy, Debug)]
@@ -133,12 +133,12 @@ pub fn revolution_head(
 
 const _: () = assert!(line::grid::NO_RETURN == Code::NoReturn.value());
 const _: () = assert!(line::grid::NOT_MEASURED == Scan::NOT_MEASURED);
-const _: () = assert!(*line::grid::BEAMS.end() == schema::BEAMS);
+const _: () = assert!(*line::grid::BEAMS.end() == scanhub_schema::BEAMS);
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Contents;
+    use scanhub_schema::Contents;
 
     #[test]
     fn writes_revolution() {

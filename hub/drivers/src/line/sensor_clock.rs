@@ -2,7 +2,7 @@
 //! delay of the last few seconds therefore holds for every packet in them, even for packets that waited while the host
 //! was stopped. The drift between the clocks is estimated too.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// The minimum delays of the last seconds.
 #[derive(Clone, Debug)]

@@ -5,7 +5,7 @@ use core::fmt;
 
 use crate::line::RawScan;
 use crate::line::family::Model;
-use schema::{Counter, Counters, Nanos, Status};
+use scanhub_schema::{Counter, Counters, Nanos, Status};
 
 /// A protocol state machine on an open port. After every call that changes it, drain [`Protocol::poll_output`] until it
 /// returns [`Output::Wait`] or [`Output::Rest`].

@@ -1,7 +1,7 @@
 //! Supervision of a stream of packets: the deadlines after which a stream is silent or its head is blocked, and the
 //! counters of its session.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::framing::Tally;
 use crate::line::session::{Account, State};

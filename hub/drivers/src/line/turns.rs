@@ -6,7 +6,7 @@
 //! two. Times are those of the scanner's clock.
 
 use crate::line::grid::{NO_RETURN, Point};
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 /// The revolution that is being measured, and the next one, with at most `N` points each.
 #[derive(Clone, Debug)]

@@ -3,7 +3,7 @@
 //! that the host can sleep meanwhile.
 
 use crate::lms::variant::BYTES_PER_TURN;
-use schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
 /// The last reads, newest last, by the number of the byte after their last one.
 #[derive(Clone, Debug)]

@@ -4,7 +4,7 @@
 //! a backlog can be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line:
 //! the stream starts again.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// Due times of one stream, and counters of all streams of a session.
 #[derive(Clone, Debug)]

@@ -3,7 +3,7 @@
 //! line.
 
 use crate::lms::framer::Tally;
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// Damage of all streams of a session.
 #[derive(Clone, Copy, Debug, Default)]

@@ -3,7 +3,7 @@
 //! It handles telegrams and deadlines; the session handles bytes. No request changes a setting that outlives a power
 //! cycle.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::{self, Control, State};
 use crate::lms::command::{MODE, Request};

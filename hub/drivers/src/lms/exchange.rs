@@ -8,7 +8,7 @@ use crate::lms::outgoing::{NAK_PAUSE, Outgoing, SOON};
 use crate::lms::reply::REFUSED;
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::Baud;
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 /// A line with at most one open request.
 #[derive(Clone, Debug)]
@@ -181,7 +181,7 @@ pub enum Heard {
 mod tests {
     use super::*;
     use crate::lms::command::Request;
-    use schema::{MILLIS, line_time};
+    use scanhub_schema::{MILLIS, line_time};
 
     #[test]
     fn waits_for_a_server_that_packs_the_longest_reply() {

@@ -14,7 +14,7 @@ use crate::lms::candidates::{Candidate, Candidates};
 use crate::lms::header::{Expect, Judgement, MAX_HEADER, Reject, State, judge};
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// What became of the bytes; every field only grows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -22,7 +22,7 @@ use crate::lms::reply::Reply;
 use crate::lms::status_report::{DIRTY, StatusReport};
 use crate::lms::telegram::{Encoded, MAX_TELEGRAM, REPLY};
 use crate::lms::variant::Baud;
-use schema::{Nanos, line_time};
+use scanhub_schema::{Nanos, line_time};
 
 /// Progress of an inquiry.
 #[derive(Clone, Debug)]

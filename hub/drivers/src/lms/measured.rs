@@ -5,7 +5,7 @@
 use crate::line::{RawScan, Values};
 use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
 use crate::lms::variant::{MAX_BEAMS, Mode, Unit, Variant};
-use schema::{Nanos, ScanHead};
+use scanhub_schema::{Nanos, ScanHead};
 
 /// Command byte of a measured-value telegram.
 pub const MEASURED: u8 = 0xB0;
@@ -190,7 +190,7 @@ pub(crate) const PARTIAL: u16 = 1 << 13;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Scan;
+    use scanhub_schema::Scan;
 
     #[test]
     fn words_are_split_as_the_mode_says() {
@@ -213,8 +213,8 @@ mod tests {
 
     #[test]
     fn a_status_knows_the_modes_with_reflector_bits() {
-        for mode in 0..schema::Status::MODE_UNKNOWN {
-            let status = schema::Status { mode, ..schema::Status::default() };
+        for mode in 0..scanhub_schema::Status::MODE_UNKNOWN {
+            let status = scanhub_schema::Status { mode, ..scanhub_schema::Status::default() };
             assert_eq!(status.has_reflector_bits(), Some(Mode(mode).intensity_bits() > 0), "{mode}");
         }
     }

@@ -5,7 +5,7 @@
 use crate::lms::command::Request;
 use crate::lms::telegram::{Encoded, REPLY};
 use crate::lms::variant::Baud;
-use schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
 /// A telegram that has a reply.
 pub trait Say {

@@ -1,7 +1,7 @@
 //! Recognizes an LMS by any telegram with a right checksum: of its stream, its boot message, or the reply to a request for
 //! its type or status. Both requests change nothing in the scanner.
 
-use schema::{Family, MICROS, MILLIS, Nanos};
+use scanhub_schema::{Family, MICROS, MILLIS, Nanos};
 
 use crate::line::probe::{Approach, Asks, Evidence, Listen};
 use crate::lms::command;

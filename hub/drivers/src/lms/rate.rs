@@ -9,7 +9,7 @@
 //! search has found the scanner at another rate, the port is set to 500,000 baud for a moment before the scanner is
 //! switched to it.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::KnownRate;
 use crate::lms::sensor::Trouble;

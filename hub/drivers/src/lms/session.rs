@@ -18,7 +18,7 @@ use crate::lms::sensor::{Sensor, Trouble};
 use crate::lms::telegram::{MAX_TELEGRAM, Telegram};
 use crate::lms::variant::{BYTES_PER_TURN, Baud, MAX_BEAMS, Mode, Unit, Variant};
 use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
-use schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
+use scanhub_schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
 
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,7 +1,7 @@
 //! Sequences of requests: the steps that bring a scanner to the requested stream, and the questions to a scanner that
 //! streams already. Settings that a scanner does not have, or does not report right after a reset, are left out.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::lms::command::Request;
 use crate::lms::outgoing::{MORE_TRIES, TRIES};

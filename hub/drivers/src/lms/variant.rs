@@ -1,7 +1,7 @@
 //! What a sensor is set to: variant (angle and resolution), unit, measuring mode, rate of the line. Numbers of the
 //! protocol with their meaning, and the times that follow from them.
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 /// One mirror turn: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
 pub const MIRROR_TURN: Nanos = 13_320_000;
@@ -61,7 +61,7 @@ impl Variant {
     /// listing table 10-17).
     pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
         let scan = self.turns() * MIRROR_TURN;
-        scan * schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
+        scan * scanhub_schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
     }
 }
 

@@ -5,7 +5,7 @@
 
 use crate::line::framing::{Format, Verdict, judge};
 use crate::line::{Buffer, Tally, suspect};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Head};

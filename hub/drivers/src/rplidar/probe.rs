@@ -1,7 +1,7 @@
 //! Recognizes an RPLIDAR by its reply to `A5 50`, sent after `A5 25`, which stops a stream: a scanner that measures does not
 //! reply. Packets alone do not prove a scanner, because those of one point have no checksum.
 
-use schema::{Family, MILLIS};
+use scanhub_schema::{Family, MILLIS};
 
 use crate::line::probe::{Approach, Asks, Evidence, Stop};
 use crate::rplidar::device_info::Info;

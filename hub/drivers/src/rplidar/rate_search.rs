@@ -3,7 +3,7 @@
 //! A scanner that lost its power is soon back at the rate of its last stream, and sends a boot message there. So that
 //! rate is remembered.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::rplidar::model::Model;
 use crate::rplidar::session::{DRAIN, FEATURES, Trouble};

@@ -6,7 +6,7 @@
 
 use core::fmt;
 
-use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
+use scanhub_schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
 use crate::line::family::{self, Features, table};
 use crate::line::{

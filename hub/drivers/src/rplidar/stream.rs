@@ -3,7 +3,7 @@
 
 use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns};
 use crate::settings::Settings;
-use schema::{Family, MILLIS, Nanos, line_time};
+use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
 use crate::rplidar::handshake::{Handshake, ScanModes};

@@ -4,7 +4,7 @@ use scanhub_drivers::Settings;
 use scanhub_drivers::ld::Session;
 use scanhub_drivers::ld::packet::{Contents, HEADER, LEN, POINTS};
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 /// A packet with a right checksum that says anything.
 fn wild(random: &mut fastrand::Rng) -> [u8; LEN] {

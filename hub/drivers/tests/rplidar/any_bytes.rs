@@ -5,7 +5,7 @@ use scanhub_drivers::line;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Mode, Model, Session};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 /// Heads of answers, of packets of all kinds, and of none.
 const HEADS: [[u8; 7]; 12] = [

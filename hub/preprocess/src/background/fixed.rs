@@ -5,7 +5,7 @@
 //! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, Runs};
-use schema::Background;
+use scanhub_schema::Background;
 
 /// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of times in a
 /// row. A beam that flips between two surfaces never learns either of them.

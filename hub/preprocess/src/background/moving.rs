@@ -4,7 +4,7 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use schema::{Background, Motion, Pose, Scan};
+use scanhub_schema::{Background, Motion, Pose, Scan};
 
 use super::{Class, INVALID, Limits, Runs};
 use crate::velocity::Velocity;

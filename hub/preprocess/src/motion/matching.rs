@@ -1,7 +1,7 @@
 //! Lays a scan onto another: each of its beams ends on the surface nearest to it, and the place where the beams are least off
 //! is that of the scan. Refuses to know where to begin.
 
-use schema::{Corner, Line};
+use scanhub_schema::{Corner, Line};
 
 use super::rigid::{Rigid, Square, add_outer, around, eigen};
 use super::view::{Surface, View};

@@ -1,6 +1,6 @@
 //! Scans without the distortion by the motion of a sensor, which measures each beam from another position.
 
-use schema::{Contents, Scan, ScanHead, ScanWord};
+use scanhub_schema::{Contents, Scan, ScanHead, ScanWord};
 
 use super::view::is_whole;
 use crate::velocity::{Velocity, times};

@@ -3,7 +3,7 @@
 
 use std::f64::consts::TAU;
 
-use schema::{Lines, Pose, Scan};
+use scanhub_schema::{Lines, Pose, Scan};
 
 /// The readings of one scan.
 pub(super) struct View {

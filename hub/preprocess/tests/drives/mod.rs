@@ -5,8 +5,8 @@ use std::collections::HashMap;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use fastrand::Rng;
-use preprocess::motion::Rigid;
-use schema::{Code, Scan, ScanHead};
+use scanhub_preprocess::motion::Rigid;
+use scanhub_schema::{Code, Scan, ScanHead};
 
 type Point = (f64, f64);
 

@@ -4,7 +4,7 @@
 use std::f64::consts::PI;
 
 use fastrand::Rng;
-use schema::{Pose, Scan, ScanHead};
+use scanhub_schema::{Pose, Scan, ScanHead};
 
 /// Beams, first angle and step of the five variants.
 pub(crate) const VARIANTS: [(usize, i32, u32); 5] = [

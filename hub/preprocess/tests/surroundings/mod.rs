@@ -4,8 +4,8 @@
 
 use std::fmt;
 
-use preprocess::background::{Class, Model};
-use schema::{Background, BackgroundHead, Foreground, ForegroundHead, Scan, ScanHead};
+use scanhub_preprocess::background::{Class, Model};
+use scanhub_schema::{Background, BackgroundHead, Foreground, ForegroundHead, Scan, ScanHead};
 
 /// The most beams of a scan.
 pub(crate) const BEAMS: usize = 401;

@@ -15,8 +15,10 @@ use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
 use scanhub_drivers::{Session, Settings, features};
-use schema::datagram::Packed;
-use schema::{Failure, Family, Flags, Header, Kind, MILLIS, Nanos, Pose, Quality, Scan, Status, Topic};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{
+    Failure, Family, Flags, Header, Kind, MILLIS, Nanos, Pose, Quality, Scan, Status, Topic,
+};
 
 use crate::convert::writers::is_made_up;
 use crate::mcap::Item;
@@ -219,7 +221,7 @@ impl Revolutions {
                 stamp_first_ns: first,
                 stamp_last_ns: last,
                 wall_ns: wall_ns(first),
-                period_us: u32::try_from(period / schema::MICROS).unwrap_or(u32::MAX),
+                period_us: u32::try_from(period / scanhub_schema::MICROS).unwrap_or(u32::MAX),
                 quality: quality as u8,
                 reasons,
                 hub_time: [0; 3],
@@ -297,7 +299,7 @@ fn scan_ns(variant: Variant) -> u64 {
 }
 
 fn line_ns(frame: &Frame) -> u64 {
-    schema::line_time(frame.telegram.len(), Baud::B500000.rate())
+    scanhub_schema::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
 /// Returns the missing responses, each with the number of the frame before which they belong.

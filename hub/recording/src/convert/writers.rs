@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use mcap::records::{Record as Parsed, op};
-use ros::bag::{self, Bag};
 use scanhub_drivers::lms::variant::Baud;
-use schema::csv::{MarkColumns, ScanColumns};
-use schema::datagram::Packed;
-use schema::file::{METADATA, Writer};
-use schema::{Failure, Flags, Header, Kind, Marks, Topic};
+use scanhub_ros::bag::{self, Bag};
+use scanhub_schema::csv::{MarkColumns, ScanColumns};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{METADATA, Writer};
+use scanhub_schema::{Failure, Flags, Header, Kind, Marks, Topic};
 
 use super::scans::{self, DecodedItem, SyntheticClock, stream_heads};
 use super::{Conversion, Packing, Written, form_name};
@@ -89,7 +89,7 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
     let contents = recording.contents();
     let first = (contents.form == Form::Carmen).then(|| {
         let telegram = carmen::configuration(encoding);
-        let took_ns = schema::line_time(telegram.len(), Baud::B500000.rate());
+        let took_ns = scanhub_schema::line_time(telegram.len(), Baud::B500000.rate());
         let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
         Frame { telegram, wall_ns, ..Frame::default() }
     });

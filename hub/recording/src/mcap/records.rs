@@ -622,7 +622,7 @@ const HEAD_OF_CHUNK: usize = 1024;
 /// and the CRC.
 const COMPRESSION: usize = 8 + 8 + 8 + 4;
 /// Bytes of a message that include the header of a sample of the hub.
-const HEAD_OF_MESSAGE: usize = 2 + 4 + 8 + 8 + size_of::<schema::Header>();
+const HEAD_OF_MESSAGE: usize = 2 + 4 + 8 + 8 + size_of::<scanhub_schema::Header>();
 /// Length of a data end.
 const DATA_END_LEN: u64 = 4;
 /// Position of the checksum in the footer.

@@ -9,14 +9,14 @@ use tempfile::TempDir;
 
 use crate::folder::{converted, file};
 use crate::real;
-use recording::convert::{ConvertOptions, Converted, Target, convert};
-use recording::{Encoding, Form, Frame, Recording};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Family, Flags, Header, Mark, Marks, Topic};
+use scanhub_recording::convert::{ConvertOptions, Converted, Target, convert};
+use scanhub_recording::{Encoding, Form, Frame, Recording};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Family, Flags, Header, Mark, Marks, Topic};
 
 const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 

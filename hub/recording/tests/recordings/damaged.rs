@@ -5,9 +5,9 @@ use std::io::Write as _;
 use std::ops::Range;
 
 use fastrand::Rng;
-use recording::{Damage, Encoding, Recording};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::file::Compression;
+use scanhub_recording::{Damage, Encoding, Recording};
+use scanhub_schema::file::Compression;
 
 use tempfile::TempDir;
 
@@ -276,8 +276,8 @@ fn intact_chunk_that_unpacks_to_too_much_is_refused_and_a_wrong_length_is_not() 
     let folder = TempDir::new().unwrap();
     // Zeros, so that the chunk is short until it is unpacked.
     let mut writer =
-        schema::file::Writer::packed(Vec::new(), "", Compression::Zstd, Default::default()).unwrap();
-    let channel = schema::file::Foreign {
+        scanhub_schema::file::Writer::packed(Vec::new(), "", Compression::Zstd, Default::default()).unwrap();
+    let channel = scanhub_schema::file::Foreign {
         topic: "/map",
         encoding: "raw",
         schema: ("map", "bytes", "text"),

@@ -6,13 +6,13 @@ use std::io::{Read, Write};
 use crate::real;
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use recording::{Encoding, Form, Recording};
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::measured::{self, Measured};
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::Family;
+use scanhub_recording::{Encoding, Form, Recording};
+use scanhub_schema::Family;
 use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

@@ -7,8 +7,8 @@ use std::sync::atomic::AtomicBool;
 
 use fastrand::Rng;
 use mcap::records::op;
-use recording::convert::{ConvertOptions, Converted, convert};
-use schema::{Failure, Kind};
+use scanhub_recording::convert::{ConvertOptions, Converted, convert};
+use scanhub_schema::{Failure, Kind};
 use tempfile::TempDir;
 
 /// Converts `bytes` to MCAP, in `folder`.

@@ -9,10 +9,10 @@ use tempfile::TempDir;
 
 use crate::folder::{converted, file};
 use crate::real;
-use recording::{Encoding, Frame, Recording, Unread};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
+use scanhub_recording::{Encoding, Frame, Recording, Unread};
 
 #[test]
 fn a_log_comes_back_from_an_mcap_file() {

@@ -3,8 +3,8 @@
 use std::fs;
 
 use crate::written::{Known, SENSORS};
-use recording::{Encoding, Form, Recording};
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use scanhub_recording::{Encoding, Form, Recording};
 use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

@@ -9,13 +9,13 @@ use tempfile::TempDir;
 use crate::folder::{converted, file};
 use crate::written::{self, Known, SENSORS, Written};
 use bytemuck::bytes_of;
-use recording::convert::{ConvertOptions, convert};
-use recording::{Encoding, Form, Recording};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::datagram::Packed;
-use schema::file::{ENCODING, ENCODING_V1, Foreign, Writer};
-use schema::{Header, Kind, Scan, ScanHead, Topic};
+use scanhub_recording::convert::{ConvertOptions, convert};
+use scanhub_recording::{Encoding, Form, Recording};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{ENCODING, ENCODING_V1, Foreign, Writer};
+use scanhub_schema::{Header, Kind, Scan, ScanHead, Topic};
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 

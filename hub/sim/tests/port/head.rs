@@ -8,12 +8,12 @@ use scanhub_drivers::ld::{Model, Session};
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::lms;
 use scanhub_drivers::{Settings, features};
-use schema::{Failure, Family, Nanos};
-use sim::fault::Faults;
-use sim::options::{Scanner, SimulateOptions};
-use sim::port::now_ns;
-use sim::simulate;
-use sim::simulate::Record;
+use scanhub_schema::{Failure, Family, Nanos};
+use scanhub_sim::fault::Faults;
+use scanhub_sim::options::{Scanner, SimulateOptions};
+use scanhub_sim::port::now_ns;
+use scanhub_sim::simulate;
+use scanhub_sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::host::Host;

@@ -19,12 +19,12 @@ use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
-use sim::fault::{Fault, Faults};
-use sim::machine::Start;
-use sim::operating::Operating;
-use sim::options::SimulateOptions;
-use sim::simulate;
-use sim::simulate::Record;
+use scanhub_sim::fault::{Fault, Faults};
+use scanhub_sim::machine::Start;
+use scanhub_sim::operating::Operating;
+use scanhub_sim::options::SimulateOptions;
+use scanhub_sim::simulate;
+use scanhub_sim::simulate::Record;
 
 use host::Host;
 use simulator::{Folder, Simulator};

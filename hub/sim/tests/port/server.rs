@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::command::Request;
-use schema::Kind;
-use sim::fault::Faults;
-use sim::options::{Scanner, SimulateOptions};
-use sim::rplidar::Model;
-use sim::simulate;
-use sim::simulate::Record;
+use scanhub_schema::Kind;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::options::{Scanner, SimulateOptions};
+use scanhub_sim::rplidar::Model;
+use scanhub_sim::simulate;
+use scanhub_sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::simulator::Simulator;

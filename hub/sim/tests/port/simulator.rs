@@ -8,11 +8,11 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::Instant;
 
-use schema::Failure;
-use sim::fault::Fault;
-use sim::options::SimulateOptions;
-use sim::simulate::{Record, Summary};
-use sim::{Ready, simulate};
+use scanhub_schema::Failure;
+use scanhub_sim::fault::Fault;
+use scanhub_sim::options::SimulateOptions;
+use scanhub_sim::simulate::{Record, Summary};
+use scanhub_sim::{Ready, simulate};
 use tempfile::TempDir;
 
 use crate::PATIENCE;

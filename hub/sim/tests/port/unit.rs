@@ -4,11 +4,11 @@ use std::fs;
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use sim::fault::Fault;
-use sim::options::{Scanner, SimulateOptions};
-use sim::rplidar::Model;
-use sim::simulate;
-use sim::simulate::Record;
+use scanhub_sim::fault::Fault;
+use scanhub_sim::options::{Scanner, SimulateOptions};
+use scanhub_sim::rplidar::Model;
+use scanhub_sim::simulate;
+use scanhub_sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::host::Host;
@@ -100,7 +100,7 @@ fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
     let of = |model| SimulateOptions {
         ports: vec![port.clone()],
         scanner: Some(Scanner::Rplidar { model, mode: 0 }),
-        state: sim::options::parse_state("streaming").expect("a state"),
+        state: scanhub_sim::options::parse_state("streaming").expect("a state"),
         ..SimulateOptions::default()
     };
     let simulator = Simulator::start(of(Model::C1));
@@ -116,6 +116,6 @@ fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
     };
     let replay = refused(SimulateOptions { replay: Some("/no/file".into()), ..of(Model::A1) });
     assert!(replay.message.contains("a1 has no recording") && replay.kind.exit_code() == 78, "{replay}");
-    let state = sim::options::parse_state("means").expect("a state");
+    let state = scanhub_sim::options::parse_state("means").expect("a state");
     assert!(refused(SimulateOptions { state, ..of(Model::A1) }).message.contains("no state"));
 }

@@ -3,16 +3,16 @@
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::recognize::{EXAMINED, family_of};
-use schema::{Family, MILLIS, Nanos};
-use sim::device::Device;
-use sim::fault::Faults;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::machine::{LmsSimulator, Settings, Start};
-use sim::operating::Operating;
-use sim::operating::Source;
-use sim::room::Room;
-use sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
-use sim::wire::LineModel;
+use scanhub_schema::{Family, MILLIS, Nanos};
+use scanhub_sim::device::Device;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::machine::{LmsSimulator, Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
+use scanhub_sim::wire::LineModel;
 
 /// Returns at most the first `len` bytes that arrive from `device` within 30 s.
 fn bytes_of(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {

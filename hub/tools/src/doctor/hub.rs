@@ -4,10 +4,10 @@
 use std::path::Path;
 use std::time::Duration;
 
-use port::{Holder, Source};
-use schema::{Failure, Kind, State, Status, is_remote};
-use shm::Payload;
-use shm::{Domain, Environment, RunningHub};
+use scanhub_port::{Holder, Source};
+use scanhub_schema::{Failure, Kind, State, Status, is_remote};
+use scanhub_shm::Payload;
+use scanhub_shm::{Domain, Environment, RunningHub};
 
 /// A running hub.
 pub(crate) struct Hub {
@@ -20,7 +20,7 @@ pub(crate) struct Hub {
 impl Hub {
     /// Returns the hub in `domain`, if there is one.
     pub(crate) fn find(domain: &Domain) -> Option<Hub> {
-        let pid = shm::holder(domain.root()).ok().flatten()?;
+        let pid = scanhub_shm::holder(domain.root()).ok().flatten()?;
         Some(Hub { pid, info: "scanhub info".to_owned(), statuses: statuses(domain).unwrap_or_default() })
     }
 
@@ -36,13 +36,14 @@ impl Hub {
         if holders.is_empty() {
             return None;
         }
-        let runs_hub = |place: &&Domain| matches!(shm::holder(place.root()), Ok(Some(pid)) if is_holder(pid));
+        let runs_hub =
+            |place: &&Domain| matches!(scanhub_shm::holder(place.root()), Ok(Some(pid)) if is_holder(pid));
         if let Some(place) = places.iter().find(runs_hub) {
             return Hub::find(place);
         }
         let running = RunningHub::all(Path::new("/")).into_iter().find(|hub| is_holder(hub.pid))?;
         let domain = Domain::at(running.domain.as_ref()?, running.base.as_ref()?).ok()?;
-        let asked = places.first().map_or(shm::DEFAULT_DOMAIN, Domain::name);
+        let asked = places.first().map_or(scanhub_shm::DEFAULT_DOMAIN, Domain::name);
         let info = running.command("info", asked, &Environment::of_process());
         Hub::find(&domain).filter(|hub| hub.pid == running.pid).map(|hub| Hub { info, ..hub })
     }
@@ -108,7 +109,7 @@ impl Hub {
             _ => {
                 let port =
                     self.source_of(status).map_or_else(|| status.port().to_owned(), |source| source.name());
-                let (stop, port) = (self.stop(holders), shm::shell_word(&port));
+                let (stop, port) = (self.stop(holders), scanhub_shm::shell_word(&port));
                 format!("{info}; or stop the hub ({stop}), then search the port: scanhub probe {port}")
             }
         }
@@ -171,10 +172,10 @@ type LinkStatus = (String, Option<Status>);
 
 /// Returns the last status of each link. A late joiner receives it within a tenth of a second.
 fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
-    let node = shm::client_node(domain)?;
+    let node = scanhub_shm::client_node(domain)?;
     let (mut found, mut subscribers) = (Vec::new(), Vec::new());
     // The ports of remote sensors are on other machines.
-    for sensor in shm::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
+    for sensor in scanhub_shm::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
         let Some(topic) = Status::open(&node, &sensor)? else { continue };
         subscribers.push(Status::subscriber(&topic)?);
         found.push((sensor, None));

@@ -13,10 +13,10 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::Duration;
 
-use port::Candidate;
 use rustix::process::{geteuid, getuid};
 use scanhub_files::regular;
-use shm::LIBRARY;
+use scanhub_port::Candidate;
+use scanhub_shm::LIBRARY;
 
 use crate::doctor::Finding;
 
@@ -448,7 +448,7 @@ const LAST_SYSTEM_USER: u32 = 999;
 
 #[cfg(test)]
 mod tests {
-    use port::found_in;
+    use scanhub_port::found_in;
 
     use crate::doctor::State;
 

@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use port::{
+use scanhub_port::{
     Candidate, Counts, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders,
     check_tty, latency_ms,
 };
-use schema::{Counter, Failure, Kind, Status};
+use scanhub_schema::{Counter, Failure, Kind, Status};
 
 use super::hub::{Hub, other_reader};
 use super::{Finding, Subject, sensor};
@@ -152,7 +152,7 @@ type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 /// Checks the scanner at `port`, which is open at `first`, in bits per second.
 fn ask(subject: &Subject, port: &Port, first: u32, stop: &AtomicBool) -> Result<Examined, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
-    match probe::find(port, first, source, link.and_then(config::Link::family), stop, |_| {}) {
+    match probe::find(port, first, source, link.and_then(scanhub_config::Link::family), stop, |_| {}) {
         Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_report(&source.name(), &report, link)))),
         Ok(Answer::Detected(heard)) => Ok(Ok((Some(heard.rate), sensor::check_rotating(&heard, link)))),
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
@@ -276,7 +276,7 @@ fn rate(subject: &Subject, port: &Port, first: u32, found: Option<u32>) -> Findi
     const NAME: &str = "rate";
     // The search for a scanner leaves out a rate that the port cannot have.
     let link = subject.link.as_ref().filter(|link| link.family().is_some());
-    let link_rate = link.map_or(probe::HIGHEST_RATE, config::Link::rate);
+    let link_rate = link.map_or(probe::HIGHEST_RATE, scanhub_config::Link::rate);
     let wanted = found.unwrap_or(link_rate);
     let outcome = port.set_baud(wanted);
     let given = port.baud().filter(|&given| given != wanted);
@@ -459,7 +459,7 @@ mod tests {
             id: "1a86:7523".to_owned(),
             chip: "CH340",
             module: "ch341",
-            reason: port::Reason::Brltty { pid: 7 },
+            reason: scanhub_port::Reason::Brltty { pid: 7 },
         };
         assert_eq!(without_port(&adapter, true).state, State::Failed);
         let found = without_port(&adapter, false);

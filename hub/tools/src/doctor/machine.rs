@@ -6,14 +6,14 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use config::needs;
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
-use schema::Failure;
-use schema::limits::TopicLimits;
-use shm::Nodes;
-use shm::shortage::SHARED_MEMORY;
-use shm::{Domain, Environment, RunningHub};
+use scanhub_config::needs;
+use scanhub_schema::Failure;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_shm::Nodes;
+use scanhub_shm::shortage::SHARED_MEMORY;
+use scanhub_shm::{Domain, Environment, RunningHub};
 
 use super::hub::Hub;
 use super::installation::is_stopped;
@@ -91,14 +91,14 @@ impl Facts {
     ) -> Facts {
         let root = domain.root();
         let elsewhere = || places.iter().filter(|place| place.root() != root);
-        let held = |place: &Domain| shm::holder(place.root()).ok().flatten();
+        let held = |place: &Domain| scanhub_shm::holder(place.root()).ok().flatten();
         let user = getuid().as_raw();
         let owner =
             |place: &Domain| place.root().ancestors().find_map(|path| Some(path.metadata().ok()?.uid()));
-        let mut nodes = shm::nodes(domain);
+        let mut nodes = scanhub_shm::nodes(domain);
         if let Ok(nodes) = &mut nodes {
             let free = elsewhere().filter(|place| held(place).is_none() && owner(place) == Some(user));
-            nodes.dead += free.filter_map(|place| Some(shm::nodes(place).ok()?.dead)).sum::<usize>();
+            nodes.dead += free.filter_map(|place| Some(scanhub_shm::nodes(place).ok()?.dead)).sum::<usize>();
         }
         // A process that runs at this location may be opening files, so they do not count as left.
         let is_empty = nodes.as_ref().is_ok_and(|nodes| nodes.alive == 0) && held(domain).is_none();
@@ -111,12 +111,12 @@ impl Facts {
             name: domain.name().to_owned(),
             root: root.to_owned(),
             place: Place::nearest(root),
-            hub: shm::holder(root),
+            hub: scanhub_shm::holder(root),
             mute: hub.map(Hub::mute).unwrap_or_default(),
             is_stopped: hub.is_some_and(|hub| is_stopped(hub.pid)),
             others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
             closed: elsewhere()
-                .filter(|place| shm::holder(place.root()).is_err())
+                .filter(|place| scanhub_shm::holder(place.root()).is_err())
                 .filter_map(|place| Some((place.root().to_owned(), owner(place)?)))
                 .collect(),
             foreign: RunningHub::all(Path::new("/"))
@@ -376,7 +376,7 @@ pub(super) use tests::{facts, says};
 
 #[cfg(test)]
 mod tests {
-    use schema::Kind;
+    use scanhub_schema::Kind;
 
     use super::*;
     use crate::doctor::State;

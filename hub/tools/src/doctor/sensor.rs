@@ -1,15 +1,15 @@
 //! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of
 //! the hub, and last a rotating scanner. `probe` sends the requests.
 
-use config::Link;
-use port::Holder;
+use scanhub_config::Link;
 use scanhub_drivers::line::{Condition as ReportedHealth, Introduction};
 use scanhub_drivers::lms::condition::{Condition, Severity};
 use scanhub_drivers::lms::errors::Fault;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::Variant;
-use schema::{State, Status};
+use scanhub_port::Holder;
+use scanhub_schema::{State, Status};
 
 use super::line::{LOSS_REMEDY, is_mostly_damaged};
 use super::{Finding, Hub};
@@ -41,7 +41,7 @@ pub(crate) fn of_hub(hub: &Hub, (name, status): (&str, &Status), holders: &[Hold
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
     let Some(mode) = status.missing_reflector_mode() else {
-        let is_lms = status.family() == Some(schema::Family::Lms);
+        let is_lms = status.family() == Some(scanhub_schema::Family::Lms);
         let why = if is_lms { "the measuring mode has reflector bits" } else { "marks.level is set" };
         return status.has_marks()?.then(|| Finding::ok(NAME, why));
     };
@@ -448,9 +448,9 @@ mod tests {
     fn reports_settings_that_differ_from_configuration() {
         let link = Link {
             name: "front".into(),
-            port: port::Source::Tty("/dev/ttyUSB0".into()),
-            scanner: config::Scanner {
-                family: Some(schema::Family::Lms),
+            port: scanhub_port::Source::Tty("/dev/ttyUSB0".into()),
+            scanner: scanhub_config::Scanner {
+                family: Some(scanhub_schema::Family::Lms),
                 settings: Settings {
                     expected_type: Some("lms291"),
                     unit_mm: Some(10),
@@ -498,9 +498,9 @@ mod tests {
     }
 
     /// Returns the family that streams without a request.
-    fn streaming() -> schema::Family {
-        let is_streaming = |family: &schema::Family| features(*family).speaks_unasked;
-        schema::Family::ALL.into_iter().find(is_streaming).expect("there is one")
+    fn streaming() -> scanhub_schema::Family {
+        let is_streaming = |family: &scanhub_schema::Family| features(*family).speaks_unasked;
+        scanhub_schema::Family::ALL.into_iter().find(is_streaming).expect("there is one")
     }
 
     fn heard() -> DetectedScanner {
@@ -520,12 +520,12 @@ mod tests {
     }
 
     fn link(set: &[&str]) -> Link {
-        let sources = config::Sources {
+        let sources = scanhub_config::Sources {
             files: Vec::new(),
             set: set.iter().map(|flag| format!("link.side.{flag}")).collect(),
             links: vec!["side=/dev/ttyUSB0".to_owned()],
         };
-        config::Config::load(&sources).expect("it is valid").links.remove(0)
+        scanhub_config::Config::load(&sources).expect("it is valid").links.remove(0)
     }
 
     #[test]

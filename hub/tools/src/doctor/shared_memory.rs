@@ -9,10 +9,10 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 
-use schema::{Failure, Kind};
-use shm::Domain;
-use shm::shortage::SHARED_MEMORY;
-use shm::{Cleaned, Segment, is_unheld};
+use scanhub_schema::{Failure, Kind};
+use scanhub_shm::Domain;
+use scanhub_shm::shortage::SHARED_MEMORY;
+use scanhub_shm::{Cleaned, Segment, is_unheld};
 
 use super::Finding;
 use super::machine::{Facts, plural};
@@ -70,7 +70,7 @@ pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
         return Finding::ok(NAME, "no domain");
     };
     for place in places {
-        if let Ok(Some(pid)) = shm::publisher(place.root()) {
+        if let Ok(Some(pid)) = scanhub_shm::publisher(place.root()) {
             let why =
                 format!("{}: process {pid} publishes there, and cleans up itself", place.root().display());
             return Finding::skipped(NAME, why);
@@ -80,7 +80,7 @@ pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
     let (mut dead, mut alive) = (0, 0);
     let mut roots = Vec::new();
     for place in places.iter().filter(|place| place.root().metadata().is_ok_and(|it| it.uid() == user)) {
-        match shm::clean(place) {
+        match scanhub_shm::clean(place) {
             Ok(Cleaned { dead: here, alive: others, root }) => {
                 dead += here;
                 alive += others;
@@ -216,7 +216,7 @@ mod tests {
     use std::path::Path;
     use std::time::{Duration, Instant};
 
-    use shm::Nodes;
+    use scanhub_shm::Nodes;
 
     use super::*;
     use crate::doctor::State;

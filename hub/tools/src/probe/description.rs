@@ -11,7 +11,7 @@ use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::variant::Mode;
 use scanhub_drivers::{Model, Report, features, lms};
-use schema::{Family, Status};
+use scanhub_schema::{Family, Status};
 use serde::Serialize;
 
 use crate::driver::DetectedScanner;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use shm::Domain;
+use scanhub_shm::Domain;
 
 /// A domain that goes with the test.
 pub(crate) struct Place {

@@ -1,6 +1,6 @@
 //! What a mount and its points say.
 
-use schema::{Cloud, CloudHead, CloudPoint, Obstacle, Obstacles, PointClass};
+use scanhub_schema::{Cloud, CloudHead, CloudPoint, Obstacle, Obstacles, PointClass};
 
 pub(super) fn cloud() -> Box<Cloud> {
     let point = |at, beam, class| CloudPoint { at, beam, point_class: class as u8, reserved: 0 };

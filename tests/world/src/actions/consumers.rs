@@ -1,6 +1,6 @@
 //! Consumers come late and leave, are killed while they hold samples, and stop for a while.
 
-use schema::{MILLIS, Topic};
+use scanhub_schema::{MILLIS, Topic};
 
 use super::{Key, Kind, SENSOR};
 use crate::consumer::Habit;

@@ -1,7 +1,7 @@
 //! A port cannot be opened for a while although it exists: without permission, because another program has it, or because
 //! the driver refuses the rate.
 
-use port::PortError;
+use scanhub_port::PortError;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

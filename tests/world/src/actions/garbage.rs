@@ -1,6 +1,6 @@
 //! Floods of random bytes and walls of start bytes come over the line for a while.
 
-use sim::fault::Faults;
+use scanhub_sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

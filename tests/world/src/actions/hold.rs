@@ -1,6 +1,6 @@
 //! Something holds the head of a scanner for a while. What has nothing of that kind does not care.
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::{Key, Kind, SENSOR};
 use crate::family::Ailment;

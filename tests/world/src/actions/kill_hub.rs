@@ -1,6 +1,6 @@
 //! The hub is killed, and another one is started after a while.
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::plan::Action;

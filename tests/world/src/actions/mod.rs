@@ -37,8 +37,8 @@ mod unplug;
 mod unwell;
 mod wall_step;
 
-use schema::Nanos;
-use sim::fault::Faults;
+use scanhub_schema::Nanos;
+use scanhub_sim::fault::Faults;
 
 use crate::plan::Action;
 use crate::world::World;

@@ -1,6 +1,6 @@
 //! The network loses, doubles, damages, delays and reorders datagrams for a while, and the gateway's sockets refuse some.
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::network::Faults;

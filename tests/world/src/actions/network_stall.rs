@@ -1,6 +1,6 @@
 //! The gateway's process does not run for a while, or the listener's.
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::plan::Action;

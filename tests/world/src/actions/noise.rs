@@ -1,6 +1,6 @@
 //! The line loses, flips, inserts and doubles bytes for a while.
 
-use sim::fault::Faults;
+use scanhub_sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

@@ -1,8 +1,8 @@
 //! Something is inside a circle for a while: a post ahead of a sensor, inside the larger circle or inside both. Of all that
 //! happens only this is known from the start, for the scans are measured before.
 
-use schema::{MILLIS, Nanos};
-use sim::room::Changes;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::room::Changes;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::{Action, Plan};

@@ -1,6 +1,6 @@
 //! A user pauses a sensor, and resumes it.
 
-use schema::Verb;
+use scanhub_schema::Verb;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

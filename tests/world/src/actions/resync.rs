@@ -1,6 +1,6 @@
 //! A user has a link begin anew, or forgets its background.
 
-use schema::Verb;
+use scanhub_schema::Verb;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

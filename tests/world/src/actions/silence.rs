@@ -1,7 +1,7 @@
 //! Nothing arrives for a while, or everything arrives late.
 
-use schema::{MILLIS, Nanos};
-use sim::fault::Faults;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

@@ -1,6 +1,6 @@
 //! The hub's process does not run for a while.
 
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::event::Event;

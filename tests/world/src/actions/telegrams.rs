@@ -1,7 +1,7 @@
 //! Whole telegrams suffer for a while: their ends are lost, their length fields are others, they come twice, the sensor breaks
 //! them off.
 
-use sim::fault::Faults;
+use scanhub_sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;

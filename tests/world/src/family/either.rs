@@ -3,10 +3,10 @@
 
 use std::rc::Rc;
 
-use schema::{Family as Name, Nanos, Scan};
-use sim::device::Device;
-use sim::ld::TruePoint;
-use sim::room::Changes;
+use scanhub_schema::{Family as Name, Nanos, Scan};
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::TruePoint;
+use scanhub_sim::room::Changes;
 
 use super::{Ailment, Begin, Exactness, Family, Scanner, is_ld_packet};
 use crate::plan::Action;

@@ -5,12 +5,12 @@ use std::rc::Rc;
 
 use scanhub_drivers::ld::Model;
 use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
-use schema::{MILLIS, Nanos, Scan};
-use sim::ChunkSize;
-use sim::device::Device;
-use sim::ld::{LdSettings, LdSimulator, Packets, TruePoint};
-use sim::room::Changes;
-use sim::room::Room;
+use scanhub_schema::{MILLIS, Nanos, Scan};
+use scanhub_sim::ChunkSize;
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets, TruePoint};
+use scanhub_sim::room::Changes;
+use scanhub_sim::room::Room;
 
 use super::{Begin, Family, INERTIA, SLOWEST, Scanner, still_rooms};
 use crate::plan::Action;
@@ -57,8 +57,8 @@ impl Family for Ld {
         Rc::new(Ld { family: "auto", is_said: false, ..self.clone() })
     }
 
-    fn families(&self) -> Vec<schema::Family> {
-        vec![schema::Family::Ld]
+    fn families(&self) -> Vec<scanhub_schema::Family> {
+        vec![scanhub_schema::Family::Ld]
     }
 
     fn rates(&self) -> Vec<u32> {
@@ -105,7 +105,7 @@ impl Family for Ld {
 
     fn begin(&self, unit: &[u8]) -> Option<Begin> {
         let packet = Packet::check(unit.first_chunk()?).ok()?;
-        let on_line = schema::line_time(LEN, self.settings.model.baud());
+        let on_line = scanhub_schema::line_time(LEN, self.settings.model.baud());
         Some(Begin { clockwise_deg: f64::from(packet.angle(0)) / 100.0, points: POINTS, on_line })
     }
 }

@@ -8,14 +8,14 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::measured::MEASURED;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::{MILLIS, Nanos, Scan};
-use sim::ChunkSize;
-use sim::device::Device;
-use sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
-use sim::operating::Operating;
-use sim::operating::Source;
-use sim::room::Room;
-use sim::room::{Changes, PrecomputedScans};
+use scanhub_schema::{MILLIS, Nanos, Scan};
+use scanhub_sim::ChunkSize;
+use scanhub_sim::device::Device;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::room::{Changes, PrecomputedScans};
 
 use super::{Family, Scanner, quirks, rooms};
 use crate::plan::Action;
@@ -74,8 +74,8 @@ impl Family for Lms {
         Rc::new(Lms { is_auto: true, variant: Variant::HALF, baud: Baud::B500000, ..self.clone() })
     }
 
-    fn families(&self) -> Vec<schema::Family> {
-        vec![schema::Family::Lms]
+    fn families(&self) -> Vec<scanhub_schema::Family> {
+        vec![scanhub_schema::Family::Lms]
     }
 
     fn rates(&self) -> Vec<u32> {
@@ -87,7 +87,7 @@ impl Family for Lms {
         let len = 2 * self.variant.beams() + 10;
         let rate = self.baud.rate();
         let turns = (len - 1) / lms::variant::BYTES_PER_TURN;
-        let on_line = schema::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
+        let on_line = scanhub_schema::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
         let period = self.variant.period(len, rate);
         (period, period + on_line)
     }

@@ -5,14 +5,14 @@
 use std::rc::Rc;
 
 use scanhub_drivers::rplidar::packet::Kind;
-use schema::{MILLIS, Nanos, Scan};
-use sim::device::Device;
-use sim::ld::TruePoint;
-use sim::machine::ProtocolQuirks;
-use sim::room::Changes;
-use sim::room::Room;
-use sim::rplidar::{Form, Model, RplidarSettings, RplidarSimulator, RplidarStart};
-use sim::{Arrival, ChunkSize};
+use scanhub_schema::{MILLIS, Nanos, Scan};
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::TruePoint;
+use scanhub_sim::machine::ProtocolQuirks;
+use scanhub_sim::room::Changes;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{Form, Model, RplidarSettings, RplidarSimulator, RplidarStart};
+use scanhub_sim::{Arrival, ChunkSize};
 
 use super::{Ailment, Begin, Exactness, Family, Scanner, quirks, still_rooms};
 use crate::plan::Action;
@@ -103,8 +103,8 @@ impl Family for Rplidar {
         Rc::new(Rplidar { family: "auto", is_said: false, mode: None, ..self.clone() })
     }
 
-    fn families(&self) -> Vec<schema::Family> {
-        vec![schema::Family::Rplidar]
+    fn families(&self) -> Vec<scanhub_schema::Family> {
+        vec![scanhub_schema::Family::Rplidar]
     }
 
     fn rates(&self) -> Vec<u32> {
@@ -304,7 +304,7 @@ fn is_triangulating(model: Model) -> bool {
 }
 
 /// So many packets a second take long to judge, and need not be in many worlds.
-fn is_moderate(mode: &sim::rplidar::Mode) -> bool {
+fn is_moderate(mode: &scanhub_sim::rplidar::Mode) -> bool {
     mode.form != Form::Standard || mode.sample_us > 150.0
 }
 
@@ -329,7 +329,7 @@ fn request(command: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 fn line_time(unit: &[u8], model: Model) -> Nanos {
-    schema::line_time(unit.len(), model.baud())
+    scanhub_schema::line_time(unit.len(), model.baud())
 }
 
 /// The models that are drawn, fast ones seldom: their points take long to measure.

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use schema::{Nanos, Topic};
+use scanhub_schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

@@ -1,7 +1,7 @@
 //! Bytes are conserved: what a status says was read is what the port handed out, and each byte of it is in a telegram, an
 //! acknowledgement, discarded, or still in the buffer.
 
-use schema::{Counter, Nanos, Status, Topic};
+use scanhub_schema::{Counter, Nanos, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use bytemuck::pod_read_unaligned;
-use schema::{MILLIS, Nanos, Scan, Topic, Verdict, Zones};
+use scanhub_schema::{MILLIS, Nanos, Scan, Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::Event;
@@ -86,7 +86,7 @@ impl Judge for Early {
 
 impl OfSensor {
     /// What is wrong with a warning, or with what takes it back.
-    fn warn(&mut self, seq: u64, early: &schema::Early, is_well: bool) -> Option<String> {
+    fn warn(&mut self, seq: u64, early: &scanhub_schema::Early, is_well: bool) -> Option<String> {
         let verdict = early.verdict();
         if !matches!(verdict, Verdict::Slow | Verdict::Stop) {
             return Some(format!("a warning says {}", verdict.name()));

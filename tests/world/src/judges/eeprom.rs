@@ -1,6 +1,6 @@
 //! Nothing that a hub says to a sensor writes its EEPROM.
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use super::{Judge, Say};
 use crate::event::Event;

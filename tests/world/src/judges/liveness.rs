@@ -4,7 +4,7 @@
 
 use std::rc::Rc;
 
-use schema::{MILLIS, Nanos, State, Status, Topic};
+use scanhub_schema::{MILLIS, Nanos, State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Event, Figures};

@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-use schema::{Counter, MILLIS, Nanos, State, Status, Topic};
-use sim::ld::TruePoint;
+use scanhub_schema::{Counter, MILLIS, Nanos, State, Status, Topic};
+use scanhub_sim::ld::TruePoint;
 
 use super::{Judge, Say};
 use crate::event::{Event, Figures};

@@ -26,7 +26,7 @@ mod stamps;
 mod turns;
 mod verdict;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use crate::event::{Event, Figures, Violation};
 use crate::plan::Plan;

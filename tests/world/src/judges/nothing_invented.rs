@@ -5,8 +5,8 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-use schema::datagram::Packed;
-use schema::{Nanos, Scan, Topic};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Nanos, Scan, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

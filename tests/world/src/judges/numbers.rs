@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use schema::{Header, Nanos, Topic};
+use scanhub_schema::{Header, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use schema::{MILLIS, Nanos, Ring, Topic};
+use scanhub_schema::{MILLIS, Nanos, Ring, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

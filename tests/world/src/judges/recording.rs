@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use bytemuck::pod_read_unaligned;
-use recording::{Encoding, Recording as File};
 use rustix::fs::{MemfdFlags, memfd_create};
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Header, Nanos, Status, Topic};
+use scanhub_recording::{Encoding, Recording as File};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Header, Nanos, Status, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

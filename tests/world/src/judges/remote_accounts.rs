@@ -4,8 +4,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use schema::datagram::{Announce, Datagram};
-use schema::{Nanos, Topic};
+use scanhub_schema::datagram::{Announce, Datagram};
+use scanhub_schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

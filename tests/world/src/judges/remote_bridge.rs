@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use schema::datagram::Announce;
-use schema::{Nanos, Topic};
+use scanhub_schema::datagram::Announce;
+use scanhub_schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

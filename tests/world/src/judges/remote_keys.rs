@@ -4,8 +4,8 @@
 
 use std::collections::{HashMap, HashSet};
 
-use schema::Nanos;
-use schema::datagram::DatagramError;
+use scanhub_schema::Nanos;
+use scanhub_schema::datagram::DatagramError;
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

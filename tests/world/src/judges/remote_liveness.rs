@@ -2,7 +2,7 @@
 //! name, and the next zones that are due go out. It knows it from then on, unless the zones come so seldom that the first ones,
 //! which do not say their period yet, are too old before the second ones come (`docs/topics.md`).
 
-use schema::{MILLIS, Nanos, Topic, Verdict, Zones};
+use scanhub_schema::{MILLIS, Nanos, Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -8,8 +8,8 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
-use schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed, WINDOW};
-use schema::{Flags, Header, MILLIS, Nanos, Quality, State, Status, Topic, Zones};
+use scanhub_schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed, WINDOW};
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Quality, State, Status, Topic, Zones};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

@@ -4,8 +4,8 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use schema::datagram::Head;
-use schema::{Flags, Header, MILLIS, Nanos, Topic};
+use scanhub_schema::datagram::Head;
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

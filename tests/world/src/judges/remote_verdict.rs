@@ -4,8 +4,8 @@
 //! a robot beside the hub believes them. And from the arrival on (`docs/topics.md`: the way there is not known) a verdict stands
 //! for two periods as sent and 40 ms, for half a second at least, and never for longer than 5.04 s; then it is unknown.
 
-use schema::datagram::Packed;
-use schema::{MILLIS, Nanos, Topic, Verdict, Zones};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{MILLIS, Nanos, Topic, Verdict, Zones};
 
 use super::{Judge, Say, verdict};
 use crate::actions::object;

@@ -1,6 +1,6 @@
 //! What was taken comes back: when all is over no line is open, no loan is out, no sample is held.
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use super::{Judge, Say};
 use crate::event::Event;

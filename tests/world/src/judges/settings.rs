@@ -1,7 +1,7 @@
 //! A port that another process sets to another rate has the hub's again soon: the hub does not read for a second what arrives
 //! at the wrong rate.
 
-use schema::{MILLIS, Nanos, Topic};
+use scanhub_schema::{MILLIS, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

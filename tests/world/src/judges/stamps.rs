@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use schema::{Flags, Header, MILLIS, Nanos, Topic, line_time};
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Topic, line_time};
 
 use super::{Judge, Say};
 use crate::event::{Event, Telegram};

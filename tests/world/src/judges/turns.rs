@@ -13,9 +13,9 @@ use std::cell::Cell;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-use schema::datagram::Packed;
-use schema::{Header, MICROS, MILLIS, Nanos, Scan, State, Status, Topic};
-use sim::ld::TruePoint;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Header, MICROS, MILLIS, Nanos, Scan, State, Status, Topic};
+use scanhub_sim::ld::TruePoint;
 
 use self::points::{Point, Told, told};
 use super::{Judge, Say};

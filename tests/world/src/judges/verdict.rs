@@ -4,7 +4,7 @@
 //! then it is unknown. A scan tells what is there when it is measured, and is on the line for a while after that; a circle is
 //! violated by so many scans in a row, each of which may come as late as a verdict stands in the hub.
 
-use schema::{MILLIS, Nanos, Verdict};
+use scanhub_schema::{MILLIS, Nanos, Verdict};
 
 use super::{Judge, Say};
 use crate::actions::object;

@@ -3,9 +3,9 @@
 
 use std::collections::VecDeque;
 
-use lan::Key;
-use schema::Nanos;
-use schema::datagram::{Datagram, HEAD, Head, LanFlags, MAC};
+use scanhub_lan::Key;
+use scanhub_schema::Nanos;
+use scanhub_schema::datagram::{Datagram, HEAD, Head, LanFlags, MAC};
 
 /// What somebody sends who has not the key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,12 +1,12 @@
 //! A life of a gateway: it follows topics of the hub as any consumer, and hands datagrams to a network. Refuses to know what
 //! becomes of those.
 
-use lan::Stamp;
-use lan::outgoing::{ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit};
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Noted, Numbers, ZonesState};
-use schema::datagram::Datagram;
-use schema::{MILLIS, Nanos, Topic};
+use scanhub_lan::Stamp;
+use scanhub_lan::outgoing::{ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit};
+use scanhub_schema::datagram::Datagram;
+use scanhub_schema::{MILLIS, Nanos, Topic};
 
 use super::payload::lend;
 use super::{Terms, WAKES};

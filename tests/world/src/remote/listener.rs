@@ -3,11 +3,11 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use lan::Stamp;
-use lan::incoming::{Arrived, Incoming};
-use lan::republish::Republisher;
-use schema::datagram::{Datagram, DatagramError, HEAD, Head};
-use schema::{Nanos, Topic};
+use scanhub_lan::Stamp;
+use scanhub_lan::incoming::{Arrived, Incoming};
+use scanhub_lan::republish::Republisher;
+use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head};
+use scanhub_schema::{Nanos, Topic};
 
 use super::robot::GATEWAY;
 use super::topics::Memory;

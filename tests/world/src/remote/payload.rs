@@ -1,7 +1,7 @@
 //! The payload of a sample as it goes over a network. Refuses to know what becomes of it.
 
-use lan::outgoing::PayloadRef;
-use schema::datagram::{HEAD, PARTS};
+use scanhub_lan::outgoing::PayloadRef;
+use scanhub_schema::datagram::{HEAD, PARTS};
 
 use super::Terms;
 use crate::topics::Sample;
@@ -12,7 +12,7 @@ macro_rules! payloads {
         /// Hands what `sample` says to `to`.
         pub(super) fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
             match sample.topic {
-                $(schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
+                $(scanhub_schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
             }
         }
     };
@@ -20,23 +20,23 @@ macro_rules! payloads {
         &$sample.bytes
     };
     (Scan $sample:ident) => {
-        &schema::Scan::of_bytes(&$sample.bytes)
+        &scanhub_schema::Scan::of_bytes(&$sample.bytes)
     };
     (Foreground $sample:ident) => {
-        &schema::Foreground::of_bytes(&$sample.bytes)
+        &scanhub_schema::Foreground::of_bytes(&$sample.bytes)
     };
     (Background $sample:ident) => {
-        &schema::Background::of_bytes(&$sample.bytes)
+        &scanhub_schema::Background::of_bytes(&$sample.bytes)
     };
     (Cloud $sample:ident) => {
-        &schema::Cloud::of_bytes(&$sample.bytes)
+        &scanhub_schema::Cloud::of_bytes(&$sample.bytes)
     };
     ($payload:ident $sample:ident) => {
-        &bytemuck::pod_read_unaligned::<schema::$payload>(&$sample.bytes)
+        &bytemuck::pod_read_unaligned::<scanhub_schema::$payload>(&$sample.bytes)
     };
 }
 
-schema::for_each_topic!(payloads);
+scanhub_schema::for_each_topic!(payloads);
 
 /// Room for a payload as in datagrams: of some payloads it says how much goes into it.
 pub(crate) struct Packet {

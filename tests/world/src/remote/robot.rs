@@ -2,8 +2,8 @@
 
 use scanhub_client::Robot;
 use scanhub_client::streams::ZonesState;
-use schema::datagram::Packed;
-use schema::{Nanos, Topic, Verdict, Zones};
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Nanos, Topic, Verdict, Zones};
 
 use super::Terms;
 use super::topics::{Memory, Published};

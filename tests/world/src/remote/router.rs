@@ -4,7 +4,7 @@
 
 use std::collections::VecDeque;
 
-use schema::{MICROS, MILLIS, Nanos};
+use scanhub_schema::{MICROS, MILLIS, Nanos};
 
 /// The router, and the links to it.
 pub(super) struct Router {

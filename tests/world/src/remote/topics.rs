@@ -5,8 +5,8 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use lan::republish::{SensorTopics, TopicStore};
-use schema::{Failure, Header, Topic, Wake};
+use scanhub_lan::republish::{SensorTopics, TopicStore};
+use scanhub_schema::{Failure, Header, Topic, Wake};
 
 /// Topics in memory, by their sensors' names. They stay when who publishes is gone.
 #[derive(Clone, Default)]

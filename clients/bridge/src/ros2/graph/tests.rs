@@ -1,7 +1,7 @@
 //! Messages of a hub, without one.
 
-use ros::{Value, read};
-use schema::{
+use scanhub_ros::{Value, read};
+use scanhub_schema::{
     CloudHead, CloudPoint, ForegroundHead, Marks, ScanHead, State, Track, TrackState, Tracks, Verdict, Zones,
 };
 
@@ -38,7 +38,7 @@ fn foreground() -> Box<Foreground> {
 fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
     let mut graph = Graph::new(Names::default(), false);
     let of_links = |topic: Topic| {
-        every(topic).filter(|_| topic.maker() != schema::Maker::Tracker).and_then(NonZeroU64::new)
+        every(topic).filter(|_| topic.maker() != scanhub_schema::Maker::Tracker).and_then(NonZeroU64::new)
     };
     assert_eq!(graph.follow("front", &of_links), 0);
     graph
@@ -129,9 +129,9 @@ fn as_many_wait_as_are_kept_and_old_ones_give_way() {
     // Of those that came 60 to 140 ms after the start, two are old at 190 ms; later on the newest is not, as the only one.
     take(&mut graph, 0);
     let first = graph.hand(at(190_000_000)).map(|handed| handed.message.to_vec()).unwrap();
-    assert_eq!(read(&ros::LASER_SCAN, &first).unwrap().number("ranges.0"), Some(5.0));
+    assert_eq!(read(&scanhub_ros::LASER_SCAN, &first).unwrap().number("ranges.0"), Some(5.0));
     let last = graph.hand(at(SECOND_NS)).map(|handed| handed.message.to_vec()).unwrap();
-    assert_eq!(read(&ros::LASER_SCAN, &last).unwrap().number("ranges.0"), Some(7.0));
+    assert_eq!(read(&scanhub_ros::LASER_SCAN, &last).unwrap().number("ranges.0"), Some(7.0));
     assert!(!graph.is_waiting());
     assert_eq!(counts(&graph), (6, 7, 1));
 }
@@ -271,10 +271,15 @@ fn a_sweep_is_one_cloud() {
 #[test]
 fn people_of_a_tracker_are_shapes_and_poses_in_its_map() {
     let mut graph = Graph::new(Names::default(), false);
-    graph.follow("house", &|topic| (topic.maker() == schema::Maker::Tracker).then_some(NonZeroU64::MIN));
+    graph.follow("house", &|topic| {
+        (topic.maker() == scanhub_schema::Maker::Tracker).then_some(NonZeroU64::MIN)
+    });
     assert!(graph.wants(0, Topic::Tracks) && !graph.wants(0, Topic::Scan));
     let topics: Vec<_> = graph.topics().iter().map(|topic| (&*topic.name, topic.of)).collect();
-    assert_eq!(topics, [("/house/tracks", ros::MARKER_ARRAY), ("/house/poses", ros::POSE_ARRAY)]);
+    assert_eq!(
+        topics,
+        [("/house/tracks", scanhub_ros::MARKER_ARRAY), ("/house/poses", scanhub_ros::POSE_ARRAY)]
+    );
     let mut tracks = Tracks::default();
     tracks.push(Track { id: 5, state: TrackState::Confirmed as u8, x_m: 2.0, ..Track::default() });
     graph.sample(0, &sample(&header(1), PayloadRef::Tracks(&tracks)), at(101 * SECOND_NS));

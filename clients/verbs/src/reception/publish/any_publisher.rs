@@ -1,10 +1,10 @@
 //! A topic of a remote sensor in shared memory, of whichever kind. Refuses to know what is in a sample.
 
 use scanhub_client::{Publication, SensorPublisher};
-use schema::datagram::Packed;
-use schema::limits::TopicLimits;
-use schema::{Failure, Header, Topic};
-use shm::Payload;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Header, Topic};
+use scanhub_shm::Payload;
 
 /// What is published from a payload as it stands in a datagram.
 trait Unpacked {
@@ -25,7 +25,7 @@ impl<P: Payload + Packed + ?Sized> Unpacked for Publication<P> {
 macro_rules! publishers {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// A topic of any kind.
-        pub(super) enum AnyPublisher { $($topic(Publication<schema::payload_type!($payload)>),)* }
+        pub(super) enum AnyPublisher { $($topic(Publication<scanhub_schema::payload_type!($payload)>),)* }
 
         impl AnyPublisher {
             /// `topic` of `sensor`, for samples as long as `limits` say.
@@ -40,7 +40,7 @@ macro_rules! publishers {
             /// Widens `limits` until `topic` has room for `payload`; whether they had not.
             pub(super) fn widen(topic: Topic, limits: &mut TopicLimits, payload: &[u8]) -> bool {
                 match topic { $(Topic::$topic => {
-                    type P = schema::payload_type!($payload);
+                    type P = scanhub_schema::payload_type!($payload);
                     if P::room(payload).is_none_or(|len| len <= topic.longest(limits)) {
                         return false;
                     }
@@ -77,4 +77,4 @@ macro_rules! publishers {
     };
 }
 
-schema::for_each_topic!(publishers);
+scanhub_schema::for_each_topic!(publishers);

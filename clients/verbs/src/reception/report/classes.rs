@@ -4,9 +4,9 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use schema::datagram::{GivenUp, Head, PORT};
+use scanhub_schema::datagram::{GivenUp, Head, PORT};
+use scanhub_shm::Domain;
 use serde::{Serialize, Serializer};
-use shm::Domain;
 
 use super::super::publish::Publication;
 use super::id;

@@ -1,15 +1,15 @@
 //! The picture in the terminal and what a browser is sent are of the same points: both are made of one scene, and what is sent
 //! is read here as the page reads it.
 
-use ::web::messages;
-use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
-use schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status, Track, Tracks};
+use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
+use scanhub_schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status, Track, Tracks};
+use scanhub_web::messages;
 use serde_json::Value as Json;
 
 use super::super::golden;
 use super::super::view::View;
 use super::{Dots, Layers};
-use scene::{Scene, Sensor};
+use scanhub_scene::{Scene, Sensor};
 
 /// Two sensors in a room, and one upside down between them, which sees something in half of its beams; one found lines.
 fn scene() -> Scene {
@@ -118,11 +118,11 @@ fn the_browser_is_sent_what_the_terminal_draws() {
     for sensor in &scene.sensors {
         let placed = Placed::of(&scene, sensor);
         let (scan, mut message) = (sensor.scan.as_ref().unwrap(), Vec::new());
-        ros::laser_scan(&mut message, ros::frame(&sensor.name), &Header::default(), scan);
+        scanhub_ros::laser_scan(&mut message, scanhub_ros::frame(&sensor.name), &Header::default(), scan);
         scans.extend(points(&message, &placed));
         if let (Some(foreground), Some(model)) = (&sensor.foreground, &sensor.background) {
             message.clear();
-            ros::foreground_cloud(&mut message, "front", &Header::default(), scan, foreground);
+            scanhub_ros::foreground_cloud(&mut message, "front", &Header::default(), scan, foreground);
             found.extend(cloud(&message, &placed));
             message.clear();
             messages::background(&mut message, &sensor.name, 1, model);

@@ -1,7 +1,7 @@
 //! What one sweep of a tilted scanner has found, as boxes. Sweeps come when the mount turns: each message takes away what was
 //! there before, and says how long it holds.
 
-use schema::{Header, Obstacle, Obstacles};
+use scanhub_schema::{Header, Obstacle, Obstacles};
 
 use super::{Colour, Cube, Deletion, Entity, Pose, Quaternion, Text, Time, Update, Vector, bytes};
 
@@ -106,7 +106,7 @@ mod tests {
         assert_eq!(one["cubes"][0]["size"], serde_json::json!({ "x": 1.0, "y": 1.0, "z": 1.5 }));
         assert_eq!(words(&found), "1 obstacle, nearest 1.0 m");
         let mut other = Obstacles { flags: 0, ..found };
-        (0..2 * schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
+        (0..2 * scanhub_schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
         assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
         other = Obstacles { flags: Obstacles::DOUBTED, ..Obstacles::default() };
         assert_eq!(words(&other), "sweep doubted, its angles contradict what is known");

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use scanhub_drivers::ld::Model;
 use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, TURN};
-use schema::{MILLIS, Nanos, line_time};
+use scanhub_schema::{MILLIS, Nanos, line_time};
 
 /// What goes wrong with bytes; shares of all bytes.
 #[derive(Clone, Copy, Debug, Default)]

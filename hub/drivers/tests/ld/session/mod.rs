@@ -8,7 +8,7 @@ use scanhub_drivers::ld::packet::LEN;
 use scanhub_drivers::ld::{Model, Session, Trouble};
 use scanhub_drivers::line::grid::Grid;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// A turn as it was handed out.
 #[derive(Debug)]

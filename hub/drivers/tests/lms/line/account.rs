@@ -4,7 +4,7 @@ use super::{Line, TELEGRAM, sent_at};
 use scanhub_drivers::line::suspect;
 use scanhub_drivers::lms::framer::{Found, Framer};
 use scanhub_drivers::lms::header::Expect;
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// A frame that a parser accepted.
 #[derive(Clone, Copy, Debug)]

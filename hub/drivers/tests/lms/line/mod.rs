@@ -12,8 +12,8 @@ pub(crate) mod scene;
 use fastrand::Rng;
 use scanhub_drivers::lms::header::StreamHeader;
 use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
+use scanhub_schema::{MICROS, Nanos};
 use scene::Scene;
-use schema::{MICROS, Nanos};
 
 /// Bytes of each telegram: 361 beams.
 pub(crate) const TELEGRAM: usize = 732;

@@ -5,7 +5,7 @@ use scanhub_drivers::line;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::rplidar::Session;
 use scanhub_drivers::rplidar::packet::Kind;
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::session::encode::Sample;
 use crate::session::head::Head;

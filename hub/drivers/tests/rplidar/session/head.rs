@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Mode, Model};
-use schema::{MILLIS, Nanos, line_time};
+use scanhub_schema::{MILLIS, Nanos, line_time};
 
 use crate::session::encode::{Sample, answer_of, encode};
 use crate::session::wire::{Damage, Sent};

@@ -3,7 +3,7 @@
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Event, Output, Protocol as _, RawScan, Session as _};
 use scanhub_drivers::rplidar::{Mode, Model, Session, Trouble};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::session::bench::{Bench, Kept, SECOND};
 use crate::session::head::Head;

@@ -4,7 +4,7 @@ use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Trouble};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use crate::session::bench::{Bench, SECOND};
 use crate::session::head::Head;

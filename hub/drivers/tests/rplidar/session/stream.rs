@@ -3,7 +3,7 @@
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::Session as _;
 use scanhub_drivers::rplidar::{Mode, Model};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use crate::session::bench::{Bench, SECOND};
 use crate::session::head::Head;

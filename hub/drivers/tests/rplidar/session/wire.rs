@@ -1,6 +1,6 @@
 //! The line behind a head: what goes wrong on it, and what was sent.
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 /// What goes wrong with bytes of packets; shares of all bytes.
 #[derive(Clone, Copy, Debug, Default)]

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use recording::convert::{ConvertOptions, Converted, convert};
-use schema::Failure;
+use scanhub_recording::convert::{ConvertOptions, Converted, convert};
+use scanhub_schema::Failure;
 use tempfile::TempDir;
 
 /// Writes a file into `folder`, and returns its path.

@@ -7,9 +7,9 @@ use fastrand::Rng;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::datagram::Packed;
-use schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
-use schema::{
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
+use scanhub_schema::{
     Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
 };
 

@@ -3,7 +3,7 @@
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::telegram::NAK;
 use scanhub_drivers::lms::variant::MIRROR_TURN;
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::session::bench::{Bench, Sent};
 

@@ -10,7 +10,7 @@ mod scene;
 
 use std::collections::HashMap;
 
-use sim::fault::Faults;
+use scanhub_sim::fault::Faults;
 
 use scene::{Scene, Verdict};
 

@@ -2,13 +2,13 @@
 
 use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::fault::Faults;
-use sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
-use sim::operating::Operating;
-use sim::operating::Source;
-use sim::room::Room;
-use sim::wire::LineModel;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::fault::Faults;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::LineModel;
 
 use super::alignment::align;
 use super::effect::Effects;

@@ -4,8 +4,8 @@
 use scanhub_drivers::Settings;
 use scanhub_drivers::ld::{Model, Session, Trouble};
 use scanhub_drivers::line::Session as _;
-use schema::{MILLIS, Nanos};
-use sim::ld::LdSettings;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::ld::LdSettings;
 
 use super::bench::{Bench, still};
 

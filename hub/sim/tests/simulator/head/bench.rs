@@ -7,14 +7,14 @@ use scanhub_drivers::ld::packet::LEN;
 use scanhub_drivers::line;
 use scanhub_drivers::line::grid::Point;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
-use schema::{MILLIS, Nanos};
-use sim::beam::NoiseModel;
-use sim::device::{Device as _, Part};
-use sim::fault::Faults;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::room::Room;
-use sim::wire::LineModel;
-use sim::world::World;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::fault::Faults;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::LineModel;
+use scanhub_sim::world::World;
 
 /// A packet that left, and whether nothing happened to it on its way.
 pub(crate) struct Sent {

@@ -7,9 +7,9 @@ use bench::{Bench, still};
 use scanhub_drivers::ld::Model;
 use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::{ld, line};
-use schema::{MILLIS, Nanos};
-use sim::ld::{LdSettings, Packets, recorded};
-use sim::world::World;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::ld::{LdSettings, Packets, recorded};
+use scanhub_sim::world::World;
 
 const SECOND: Nanos = 1_000 * MILLIS;
 

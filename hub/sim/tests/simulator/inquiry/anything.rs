@@ -1,7 +1,6 @@
 //! Random bytes and random orders of events: nothing panics, everything comes to its end, and nothing is said that was
 //! not to be.
 
-use lms_configure::{Change, Consent, OwnedConfiguration, Plan};
 use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::configuration::factory;
@@ -9,7 +8,8 @@ use scanhub_drivers::lms::framer::Tally;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::telegram::{FRAME, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use schema::{MILLIS, Nanos};
+use scanhub_lms_configure::{Change, Consent, OwnedConfiguration, Plan};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
 fn drive<C: Protocol>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {

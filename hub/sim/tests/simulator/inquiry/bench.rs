@@ -7,15 +7,15 @@ use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::telegram::{Encoded, FRAME};
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MICROS, MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::{Device as _, Part};
-use sim::fault::Faults;
-use sim::machine::{LmsSimulator, Settings};
-use sim::operating::Source;
-use sim::room::Room;
-use sim::wire::BaudMismatch;
-use sim::wire::{Delivery, LineModel};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::fault::Faults;
+use scanhub_sim::machine::{LmsSimulator, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::BaudMismatch;
+use scanhub_sim::wire::{Delivery, LineModel};
 
 /// What becomes of bytes on their way.
 pub(crate) type Way = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;

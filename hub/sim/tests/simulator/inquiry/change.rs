@@ -1,16 +1,16 @@
 //! Changing what a sensor keeps for ever, with consent: written once, read back, and the stream goes on; and what is
 //! known when it goes wrong.
 
-use lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::configuration::Configuration;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::telegram::{NAK, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use schema::{MILLIS, Nanos};
-use sim::device::Device as _;
-use sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
-use sim::operating::Operating;
+use scanhub_lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, machine, make_stream, sensor};
 

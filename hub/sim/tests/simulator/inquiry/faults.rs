@@ -1,14 +1,14 @@
 //! The fault table against conversations that come to an end: they end, what they tell is true, and a change writes no
 //! more often than it may and never unnoticed.
 
-use lms_configure::Change;
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::variant::Baud;
-use schema::MILLIS;
-use sim::device::Device as _;
-use sim::fault::Faults;
-use sim::machine::{LmsSimulator, ProtocolQuirks};
-use sim::wire::LineModel;
+use scanhub_lms_configure::Change;
+use scanhub_schema::MILLIS;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks};
+use scanhub_sim::wire::LineModel;
 
 use super::bench::{Bench, make_stream, sensor};
 use super::change::{again, change, other_values, plan};

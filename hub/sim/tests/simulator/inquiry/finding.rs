@@ -4,10 +4,10 @@ use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::telegram::{Encoded, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use schema::MILLIS;
-use sim::device::Device as _;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::MILLIS;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, machine, make_stream, say, sensor};
 

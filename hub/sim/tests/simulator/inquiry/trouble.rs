@@ -2,8 +2,8 @@
 
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::variant::Baud;
-use schema::MILLIS;
-use sim::machine::ProtocolQuirks;
+use scanhub_schema::MILLIS;
+use scanhub_sim::machine::ProtocolQuirks;
 
 use super::bench::{Bench, make_stream, sensor};
 

@@ -1,11 +1,11 @@
 //! A sensor with a clock of its own, and everything that it has sent.
 
-use schema::{MICROS, MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::{Chunk, Device as _, Part, Sent};
-use sim::machine::{LmsSimulator, Settings};
-use sim::operating::Source;
-use sim::room::Room;
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::{Chunk, Device as _, Part, Sent};
+use scanhub_sim::machine::{LmsSimulator, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
 
 /// A machine with a clock of its own and everything that it has sent.
 pub(crate) struct Bench {

@@ -13,13 +13,13 @@ use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, NAK, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
-use schema::{MICROS, MILLIS, Nanos, line_time};
-use sim::device::{Device as _, Part};
-use sim::machine::{LmsSimulator, Settings};
-use sim::operating::Source;
-use sim::room::Room;
-use sim::world::World;
-use sim::{Arrival, ChunkSize, Dropped};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::machine::{LmsSimulator, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
+use scanhub_sim::{Arrival, ChunkSize, Dropped};
 
 use bench::Bench;
 

@@ -3,9 +3,9 @@
 use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::telegram::{Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Unit, Variant};
-use schema::{MILLIS, Nanos};
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::Bench;
 use super::fast;

@@ -4,10 +4,10 @@ use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
-use schema::{MILLIS, Nanos};
-use sim::device::Device as _;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::Bench;
 use super::{fast, reply};

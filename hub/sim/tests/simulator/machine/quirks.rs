@@ -1,16 +1,16 @@
 //! Bad quirks of a sensor, each alone.
 
-use lms_configure::eeprom::{PowerOn, Write};
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::operating::Operating;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, NAK};
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MICROS, MILLIS, line_time};
-use sim::device::Device as _;
-use sim::machine::{ProtocolQuirks, Settings};
-use sim::{Arrival, Dropped};
+use scanhub_lms_configure::eeprom::{PowerOn, Write};
+use scanhub_schema::{MICROS, MILLIS, line_time};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{ProtocolQuirks, Settings};
+use scanhub_sim::{Arrival, Dropped};
 
 use super::bench::Bench;
 use super::{fast, reply};
@@ -124,7 +124,7 @@ fn a_strict_sensor_does_not_measure_in_installation_mode() {
             assert_eq!(reply == Some(0x92), strict, "{request:?}");
         }
         bench.ask(Request::Stop.encode(0).bytes());
-        assert_eq!(*bench.machine.operating(), sim::operating::Operating::OnRequest);
+        assert_eq!(*bench.machine.operating(), scanhub_sim::operating::Operating::OnRequest);
         let bytes = bench.ask(Request::Stream.encode(0).bytes());
         assert_eq!(bytes[5], 0xA0);
     }

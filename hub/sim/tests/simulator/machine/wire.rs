@@ -1,16 +1,16 @@
 //! What the wire does to bytes, and whether it says the truth of it.
 
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::ChunkSize;
-use sim::device::Part;
-use sim::fault::{Fault, Faults};
-use sim::machine::{LmsSimulator, Settings, Start};
-use sim::operating::Operating;
-use sim::operating::Source;
-use sim::room::Room;
-use sim::wire::LineModel;
-use sim::world::World;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::ChunkSize;
+use scanhub_sim::device::Part;
+use scanhub_sim::fault::{Fault, Faults};
+use scanhub_sim::machine::{LmsSimulator, Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::LineModel;
+use scanhub_sim::world::World;
 
 /// A telegram with the bytes that arrived in its time, and the verdict.
 struct Told {

@@ -7,17 +7,17 @@ use scanhub_drivers::ld;
 use scanhub_drivers::line::{self, Output, Protocol};
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::{Found, Memory, PortKind, Search};
-use schema::{MICROS, MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::Device;
-use sim::fault::Faults;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::machine::{self, LmsSimulator, Start};
-use sim::operating::Operating;
-use sim::room::Room;
-use sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
-use sim::wire::BaudMismatch;
-use sim::wire::LineModel;
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::Device;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::machine::{self, LmsSimulator, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
+use scanhub_sim::wire::BaudMismatch;
+use scanhub_sim::wire::LineModel;
 
 /// Host's end of the line: a search, or a session to compare it with.
 pub(crate) trait Host {
@@ -132,7 +132,7 @@ pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
     let operating = if streams { Operating::All } else { Operating::OnRequest };
     let settings =
         machine::Settings { baud, start: Start::In(operating), seed, ..machine::Settings::default() };
-    Box::new(LmsSimulator::new(settings, sim::operating::Source::Room(room(seed))))
+    Box::new(LmsSimulator::new(settings, scanhub_sim::operating::Source::Room(room(seed))))
 }
 
 pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {

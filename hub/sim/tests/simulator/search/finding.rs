@@ -4,9 +4,9 @@ use scanhub_drivers::ld;
 use scanhub_drivers::line::Protocol as _;
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::{Found, PortKind, Search};
-use schema::{Family, MILLIS, Nanos};
-use sim::device::Device;
-use sim::rplidar::Model;
+use scanhub_schema::{Family, MILLIS, Nanos};
+use scanhub_sim::device::Device;
+use scanhub_sim::rplidar::Model;
 
 use super::bench::{self, Bench};
 

@@ -2,7 +2,7 @@
 
 use scanhub_drivers::line::{Output, Protocol as _};
 use scanhub_drivers::search::{PortKind, Search};
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 /// Passes `bytes` to a search on `port`, in reads of at most `most` bytes, until `seconds` have passed.
 fn feed(

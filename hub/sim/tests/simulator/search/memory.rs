@@ -4,9 +4,9 @@ use scanhub_drivers::line::{KnownRate, Session as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::search::{Memory, PortKind};
 use scanhub_drivers::{Settings, ld, lms, rplidar};
-use schema::{Family, MILLIS, Nanos};
-use sim::device::Device;
-use sim::rplidar::Model;
+use scanhub_schema::{Family, MILLIS, Nanos};
+use scanhub_sim::device::Device;
+use scanhub_sim::rplidar::Model;
 
 use super::bench::{self, Bench};
 use super::finding::scanners;

@@ -5,9 +5,9 @@ use scanhub_drivers::line::{self, Account, Protocol, Session as _, State};
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{PortSession, Settings, ld};
-use schema::{Counter, Counters, Family, MICROS, MILLIS, Nanos, Status};
-use sim::device::Device;
-use sim::rplidar::Model;
+use scanhub_schema::{Counter, Counters, Family, MICROS, MILLIS, Nanos, Status};
+use scanhub_sim::device::Device;
+use scanhub_sim::rplidar::Model;
 
 use super::bench::{self, Bench, Event, Host};
 

@@ -3,12 +3,12 @@
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::PortKind;
-use schema::{MILLIS, Nanos};
-use sim::device::Device;
-use sim::ld::{LdSettings, LdSimulator, Packets};
-use sim::machine::{self, LmsSimulator};
-use sim::operating::Source;
-use sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::machine::{self, LmsSimulator};
+use scanhub_sim::operating::Source;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 
 use super::bench::{self, Bench};
 

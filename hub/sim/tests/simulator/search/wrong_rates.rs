@@ -2,11 +2,11 @@
 
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::Device;
-use sim::rplidar::Model;
-use sim::wire::Receiver;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::Device;
+use scanhub_sim::rplidar::Model;
+use scanhub_sim::wire::Receiver;
 
 use super::bench;
 
@@ -54,7 +54,7 @@ fn received(request: &[u8], sent_at: u32, rate: u32, gap: Nanos, drift: f64) -> 
 /// Returns how many telegrams that are not part of a stream, and how many parts of broken ones, `device` sends from `now` until
 /// `end`.
 fn reactions(device: &mut dyn Device, now: &mut Nanos, end: Nanos) -> usize {
-    use sim::device::Part;
+    use scanhub_sim::device::Part;
     let mut count = 0;
     loop {
         while let Some(chunk) = device.poll_transmit(*now) {

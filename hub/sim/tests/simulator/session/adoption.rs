@@ -4,10 +4,10 @@ use scanhub_drivers::line::{Control, Session as _, State};
 use scanhub_drivers::lms::Settings;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use schema::{MICROS, MILLIS};
-use sim::device::Device as _;
-use sim::machine::{self, Start};
-use sim::operating::Operating;
+use scanhub_schema::{MICROS, MILLIS};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{self, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, WANTED, make_stream, sensor, sensor_with};
 

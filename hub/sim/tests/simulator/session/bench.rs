@@ -10,15 +10,15 @@ use scanhub_drivers::lms::Session;
 use scanhub_drivers::lms::Settings;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MICROS, MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::{Device as _, Part};
-use sim::fault::{Fault, Faults};
-use sim::machine::{self, LmsSimulator};
-use sim::operating::Source;
-use sim::room::Room;
-use sim::wire::BaudMismatch;
-use sim::wire::{Delivery, LineModel};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::fault::{Fault, Faults};
+use scanhub_sim::machine::{self, LmsSimulator};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::BaudMismatch;
+use scanhub_sim::wire::{Delivery, LineModel};
 
 /// From sensor to host: what becomes of a chunk that is through at this time.
 pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
@@ -375,7 +375,7 @@ impl Bench {
                 self.damaged = false;
                 self.acknowledged.extend(brought.first().map(|&byte| (self.now, byte)));
             }
-            Some(Part::End(sim::device::Sent { is_reply, telegram, aborted })) => {
+            Some(Part::End(scanhub_sim::device::Sent { is_reply, telegram, aborted })) => {
                 let fault = self.fault.take();
                 let damaged = std::mem::take(&mut self.damaged) || fault.is_some();
                 let streams = self.is_streaming();

@@ -4,8 +4,8 @@ use scanhub_drivers::line::{Control, Session as _, State};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::operating::Operating;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, make_stream, sensor};
 

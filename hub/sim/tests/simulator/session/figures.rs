@@ -1,9 +1,9 @@
 //! The figure of a start: every rate, idle, streaming or left in installation mode, to the first scan.
 
 use scanhub_drivers::lms::variant::Baud;
-use schema::MILLIS;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::MILLIS;
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, sensor_with};
 

@@ -3,7 +3,7 @@
 use scanhub_drivers::line::State;
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::lms::{Settings, Trouble};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
 use super::bench::{Bench, WANTED, make_stream, sensor};
 

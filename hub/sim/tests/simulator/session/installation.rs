@@ -3,10 +3,10 @@
 
 use scanhub_drivers::lms::Notice;
 use scanhub_drivers::lms::variant::Baud;
-use schema::MILLIS;
-use sim::device::Device as _;
-use sim::machine::{ProtocolQuirks, Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::MILLIS;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, sensor_with};
 

@@ -3,8 +3,8 @@
 use scanhub_drivers::line::{Control, Session as _};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::fault::{Faults, Loss};
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::fault::{Faults, Loss};
 
 use super::bench::{Bench, sensor};
 

@@ -4,10 +4,10 @@
 use scanhub_drivers::line::State;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MILLIS, Nanos};
-use sim::device::Device as _;
-use sim::machine::{LmsSimulator, Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{LmsSimulator, Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, WANTED, sensor_with};
 

@@ -4,9 +4,9 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::Notice;
 use scanhub_drivers::lms::condition::Condition;
 use scanhub_drivers::lms::variant::Baud;
-use schema::MILLIS;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::MILLIS;
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, ToHost, sensor_with};
 

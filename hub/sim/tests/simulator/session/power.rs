@@ -6,11 +6,11 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::device::Device as _;
-use sim::fault::Faults;
-use sim::machine::{ProtocolQuirks, Settings, Start};
-use sim::wire::LineModel;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
+use scanhub_sim::wire::LineModel;
 
 use super::bench::{Bench, sensor_with};
 
@@ -190,7 +190,7 @@ fn a_reset_by_somebody_else_is_a_power_cycle() {
     bench.run(100 * MILLIS);
     let now = bench.now;
     for (i, &byte) in Request::Reset.encode(0).bytes().iter().enumerate() {
-        bench.machine.receive(byte, sim::Arrival::at(now + 1_200_000 * i as u64));
+        bench.machine.receive(byte, scanhub_sim::Arrival::at(now + 1_200_000 * i as u64));
     }
     bench.run(1_000 * MILLIS);
     bench.until("streaming", LIMIT, |bench| bench.is_streaming());

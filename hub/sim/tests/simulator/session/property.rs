@@ -1,7 +1,6 @@
 //! Whatever happens in whatever order: nothing panics, no byte is unaccounted for, no request writes the EEPROM, and
 //! once a healthy sensor is there, its stream is. One seed reproduces a run.
 
-use lms_configure::eeprom::Write;
 use scanhub_drivers::line::{Control, State};
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms;
@@ -11,9 +10,10 @@ use scanhub_drivers::lms::command::{EEPROM_WRITES, Request};
 use scanhub_drivers::lms::reply::{self, Health};
 use scanhub_drivers::lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::{MILLIS, Nanos, line_time};
-use sim::machine::{self, Start};
-use sim::operating::Operating;
+use scanhub_lms_configure::eeprom::Write;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_sim::machine::{self, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, WANTED, sensor_with};
 

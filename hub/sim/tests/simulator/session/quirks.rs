@@ -4,9 +4,9 @@ use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
-use schema::MILLIS;
-use sim::machine::{ProtocolQuirks, Settings, Start};
-use sim::operating::Operating;
+use scanhub_schema::MILLIS;
+use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, WANTED, sensor_with};
 

@@ -3,11 +3,11 @@
 
 use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MICROS, MILLIS};
-use sim::ChunkSize;
-use sim::machine::{LmsSimulator, Settings};
-use sim::operating::Source;
-use sim::room::Room;
+use scanhub_schema::{MICROS, MILLIS};
+use scanhub_sim::ChunkSize;
+use scanhub_sim::machine::{LmsSimulator, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
 
 use super::bench::{Bench, Received, Sent, make_stream, sensor};
 

@@ -6,12 +6,12 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::variant::Baud;
-use schema::{MILLIS, Nanos};
-use sim::device::Device as _;
-use sim::fault::Faults;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
-use sim::wire::LineModel;
+use scanhub_schema::{MILLIS, Nanos};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::fault::Faults;
+use scanhub_sim::machine::{Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::wire::LineModel;
 
 use super::bench::{Bench, WANTED, make_stream, sensor, sensor_with};
 
@@ -191,6 +191,6 @@ fn pause_and_silence_keep_the_limit() {
 fn messages_fit_into_a_status() {
     for trouble in [FALLS_BACK, KEEPS] {
         let text = trouble.map(|trouble| trouble.to_string()).unwrap_or_default();
-        assert!(text.contains("RS-422") && text.len() <= schema::Status::MAX_ERROR_LEN, "{text}");
+        assert!(text.contains("RS-422") && text.len() <= scanhub_schema::Status::MAX_ERROR_LEN, "{text}");
     }
 }

@@ -3,10 +3,10 @@
 use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::MILLIS;
+use scanhub_schema::MILLIS;
 
-use sim::machine::{ProtocolQuirks, Settings, Start};
-use sim::operating::Operating;
+use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
 
 use super::bench::{Bench, make_stream, sensor, sensor_with};
 
@@ -38,8 +38,9 @@ fn from_each_rate_to_a_stream_within_three_seconds() {
 #[test]
 fn a_sensor_with_another_variant_is_set_to_the_wanted_one() {
     let settings = Settings { variant: Variant::ALL[4], baud: Baud::B38400, ..Settings::default() };
-    let room = sim::room::Room::new(&sim::world::World::Random, 3);
-    let machine = sim::machine::LmsSimulator::new(settings, sim::operating::Source::Room(room));
+    let room = scanhub_sim::room::Room::new(&scanhub_sim::world::World::Random, 3);
+    let machine =
+        scanhub_sim::machine::LmsSimulator::new(settings, scanhub_sim::operating::Source::Room(room));
     let mut bench = Bench::new(machine, 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);

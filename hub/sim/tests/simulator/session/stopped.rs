@@ -3,10 +3,10 @@
 use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use schema::{MICROS, MILLIS, Nanos};
-use sim::machine::{LmsSimulator, Settings};
-use sim::operating::Source;
-use sim::room::Room;
+use scanhub_schema::{MICROS, MILLIS, Nanos};
+use scanhub_sim::machine::{LmsSimulator, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
 
 use super::bench::{Bench, WANTED};
 

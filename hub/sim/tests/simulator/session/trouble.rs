@@ -4,10 +4,10 @@ use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
-use schema::MILLIS;
-use sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
-use sim::operating::Source;
-use sim::room::Room;
+use scanhub_schema::MILLIS;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
 
 use super::bench::{Bench, make_stream, sensor};
 

@@ -1,9 +1,9 @@
 //! What is answered to each request, and what follows from it: streams, the motor, a new start.
 
-use schema::MILLIS;
-use sim::device::Device as _;
-use sim::rplidar::{Form, Model, RplidarSettings, RplidarStart};
-use sim::world::World;
+use scanhub_schema::MILLIS;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::rplidar::{Form, Model, RplidarSettings, RplidarStart};
+use scanhub_sim::world::World;
 
 use super::bench::{Bench, SECOND, start, with_payload};
 

@@ -1,13 +1,13 @@
 //! A scanner of Slamtec and its line in virtual time: what a host asks goes in, what it sends comes out.
 
-use schema::{MILLIS, Nanos, line_time};
-use sim::Arrival;
-use sim::device::{Device as _, Part};
-use sim::fault::Faults;
-use sim::room::Room;
-use sim::rplidar::{RplidarSettings, RplidarSimulator};
-use sim::wire::LineModel;
-use sim::world::World;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_sim::Arrival;
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::fault::Faults;
+use scanhub_sim::room::Room;
+use scanhub_sim::rplidar::{RplidarSettings, RplidarSimulator};
+use scanhub_sim::wire::LineModel;
+use scanhub_sim::world::World;
 
 pub(crate) const SECOND: Nanos = 1_000 * MILLIS;
 

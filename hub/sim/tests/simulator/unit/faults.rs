@@ -1,8 +1,8 @@
 //! How a scanner fails, and what the line does to its packets: each fault, with what the truth says of it.
 
-use sim::device::Device as _;
-use sim::rplidar::{Model, RplidarSettings, RplidarStart};
-use sim::world::World;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarStart};
+use scanhub_sim::world::World;
 
 use super::bench::{Bench, SECOND, start};
 

@@ -1,9 +1,9 @@
 //! Points beside what was measured: each form of packet of each model, and what is odd about an A1.
 
-use schema::Nanos;
-use sim::beam::NoiseModel;
-use sim::rplidar::{Form, Model, RplidarSettings};
-use sim::world::World;
+use scanhub_schema::Nanos;
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::rplidar::{Form, Model, RplidarSettings};
+use scanhub_sim::world::World;
 
 use super::bench::{Bench, SECOND, start};
 use super::decode::{Point, capsules, standard};
@@ -70,7 +70,7 @@ fn every_point_of_every_mode_of_every_model_is_where_it_was_measured() {
             }
             assert!(edges * 100 <= ranges, "{model:?} {mode:?}: {edges} of {ranges}");
             assert!(ranges * 2 > points.len(), "{model:?} {mode:?}: {ranges} of {}", points.len());
-            assert_eq!(sim::device::Device::eeprom_writes(&bench.unit), 0);
+            assert_eq!(scanhub_sim::device::Device::eeprom_writes(&bench.unit), 0);
         }
     }
 }

@@ -4,11 +4,11 @@ use scanhub_drivers::Settings;
 use scanhub_drivers::line::grid::NO_RETURN;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Trouble};
-use schema::{MILLIS, Nanos, line_time};
-use sim::beam::NoiseModel;
-use sim::device::Device as _;
-use sim::rplidar::{Model, RplidarSettings, RplidarStart};
-use sim::world::World;
+use scanhub_schema::{MILLIS, Nanos, line_time};
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::device::Device as _;
+use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarStart};
+use scanhub_sim::world::World;
 
 use super::bench::{Bench, SECOND};
 

@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 
 use proptest::prelude::*;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::Failure;
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_schema::Failure;
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 use super::{SCAN_NS, WORLDS, look, room, text, world};
 
@@ -66,7 +66,7 @@ fn ten_seeds_are_ten_runs() {
         ["fig8", "standing", "approach", "door", "corridor", "glass", "faint", "sun", "chair", "crowd"]
     {
         let world: World = name.parse().unwrap();
-        let world = world.with_noise(sim::beam::NoiseModel::NONE);
+        let world = world.with_noise(scanhub_sim::beam::NoiseModel::NONE);
         let scan = |seed| Room::new(&world, seed).scan(Variant::HALF, Unit::Mm, Mode(1), 17_000_000_000);
         let runs: BTreeSet<Vec<u16>> = (0..10).map(scan).collect();
         assert_eq!(runs.len(), 10, "{name}");
@@ -77,7 +77,7 @@ fn ten_seeds_are_ten_runs() {
 #[test]
 fn ports_share_a_world_until_its_sensors_are_taken() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
-    let quiet = world(&text).with_noise(sim::beam::NoiseModel::NONE);
+    let quiet = world(&text).with_noise(scanhub_sim::beam::NoiseModel::NONE);
     let noisy = world(&text);
     let scan = |world, port| look(&Room::of_port(world, 5, port), 20_000_000_000).words;
     assert_eq!(quiet.sensors(), 2);

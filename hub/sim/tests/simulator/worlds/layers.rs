@@ -1,10 +1,10 @@
 //! Each layer of noise is seen to act, and to be off when it is switched off.
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use sim::beam::NoiseModel;
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 use super::{SCAN_NS, look, text, world};
 

@@ -7,10 +7,10 @@ mod tilted;
 mod truth;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::Nanos;
-use sim::room::LabeledScan;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_schema::Nanos;
+use scanhub_sim::room::LabeledScan;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 /// The directory of the files.
 const WORLDS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/worlds");

@@ -1,11 +1,11 @@
 //! What a tilted sensor measures, against the geometry of what stands there.
 
-use schema::{Nanos, Scan, ScanHead};
-use sim::beam::NoiseModel;
-use sim::mount::Mount;
-use sim::room::BeamTarget;
-use sim::room::Room;
-use sim::world::World;
+use scanhub_schema::{Nanos, Scan, ScanHead};
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::mount::Mount;
+use scanhub_sim::room::BeamTarget;
+use scanhub_sim::room::Room;
+use scanhub_sim::world::World;
 
 use super::{look, text, world};
 

@@ -1,9 +1,9 @@
 //! The truth beside the words, against a world that lacks the thing or the person in question.
 
-use schema::Nanos;
-use sim::beam::NoiseModel;
-use sim::room::Room;
-use sim::room::{BeamTarget, LabeledScan};
+use scanhub_schema::Nanos;
+use scanhub_sim::beam::NoiseModel;
+use scanhub_sim::room::Room;
+use scanhub_sim::room::{BeamTarget, LabeledScan};
 
 use super::{look, text, world};
 

@@ -1,6 +1,6 @@
 //! Where the points of a scan were measured, if not where it says.
 
-use schema::{MILLIS, Nanos};
+use scanhub_schema::{MILLIS, Nanos};
 
 use super::points::{Point, Told};
 use super::{NEAR, OfSensor};

@@ -1,7 +1,7 @@
 //! A point as a head measured it and as a scan tells it, and whether both are the same.
 
-use schema::{Code, Nanos, Scan};
-use sim::ld::TruePoint;
+use scanhub_schema::{Code, Nanos, Scan};
+use scanhub_sim::ld::TruePoint;
 
 use crate::event::Figures;
 use crate::family::Exactness;

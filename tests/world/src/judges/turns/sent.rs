@@ -2,7 +2,7 @@
 
 use std::collections::hash_map::Entry;
 
-use schema::Nanos;
+use scanhub_schema::Nanos;
 
 use super::{LONG_GAP, MOST, OfSensor, PROMPT};
 use crate::event::Telegram;
