@@ -1,5 +1,5 @@
 """Locks of the publishers in a domain: one process publishes under each name, and its lock ends with it. The files are
-those of the hub (schema/shm/src/lock.rs)."""
+those of the hub (schema/shm/src/processes.rs)."""
 
 from __future__ import annotations
 

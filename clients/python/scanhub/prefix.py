@@ -1,6 +1,6 @@
 """Prefix of the names of a domain's shared memory: `sh_DOMAIN_`, then a random word. It is stored in the file `prefix`
 of the domain's directory while any process uses the domain. The rules are those of the hub
-(schema/shm/src/prefix.rs)."""
+(schema/shm/src/segments.rs)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-//! The control service: a client's request, the hub's response, and the two events that wake each of them for the
-//! other. Refuses to know what a request means.
+//! The control service: requests of clients, responses of the hub, and two events, one that wakes the hub and one that wakes
+//! clients. The hub's crate handles requests.
+
+use std::fmt::Debug;
 
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
@@ -11,12 +13,12 @@ use iceoryx2::service::port_factory::request_response;
 
 use scanhub_schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
 
-use crate::node::Node;
+use crate::processes::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::wake::{Listener, Notifier, WakeService, listener, take_wakeups};
 
-/// The hub's end. Its [`requests`](Self::requests) wake when a request was sent.
+/// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
 pub struct ControlServer {
     server: server::Server<Service, [u8], (), [u8], ()>,
     requests: Listener,
@@ -25,7 +27,7 @@ pub struct ControlServer {
     _bells: [WakeService; 2],
 }
 
-/// A request that was received and not answered yet; one that is dropped stays without an answer.
+/// A request that has no response yet. If it is dropped, it gets none.
 pub struct Asked(ActiveRequest<Service, [u8], (), [u8], ()>);
 
 /// A client's end.
@@ -37,17 +39,18 @@ pub struct ControlClient {
     _bells: [WakeService; 2],
 }
 
-/// A request that was sent; dropping it cancels it.
+/// A request that was sent. Dropping it cancels the request.
 pub struct Pending(PendingResponse<Service, [u8], (), [u8], ()>);
 
 type ControlService = request_response::PortFactory<Service, [u8], (), [u8], ()>;
 
 impl ControlServer {
-    /// Returns the hub's end of the service, made if it is not there.
+    /// Returns the hub's end of the service, which is created if it does not exist.
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`] if another hub has it, [`Kind::Short`] if there is no memory for it.
+    /// Returns [`Kind::Short`] if memory or descriptors are short, or if another hub is its server, and [`Kind::Failed`] if
+    /// the service has another layout.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(CONTROL)?;
         let control = create(node, &service, || {
@@ -74,60 +77,59 @@ impl ControlServer {
         Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
     }
 
-    /// Returns what is woken by requests.
+    /// Returns the listener that requests wake.
     pub fn requests(&self) -> &Listener {
         &self.requests
     }
 
-    /// Returns the next request whose client still waits, or nothing. Takes the wake-ups that are pending.
+    /// Returns the next request whose client still waits, or `None`. Takes the pending wake-ups.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if the client cannot be connected.
+    /// Returns [`Kind::Short`] if the client cannot be connected.
     pub fn receive(&self) -> Result<Option<Asked>, Failure> {
         take_wakeups(&[&self.requests])?;
         let received = self.server.receive();
         received.map(|asked| asked.map(Asked)).map_err(|error| no_port(self.control.name(), &error))
     }
 
-    /// Answers `asked`. A client that does not wait any more is no failure, one that cannot be told is.
+    /// Sends `response` to the client of `asked`, if it still waits.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if a client that waits cannot be told.
+    /// Returns [`Kind::Short`] if the response cannot be sent.
     pub fn answer(&self, asked: Asked, response: &Response) -> Result<(), Failure> {
         if !asked.is_waited_for() {
             return Ok(());
         }
         let bytes = response.encode();
-        let untold = |error: &dyn std::fmt::Debug| {
-            Failure::new(Kind::Short, format!("cannot answer a client: {error:?}"), "")
-        };
-        let loan = asked.0.loan_slice_uninit(bytes.len()).map_err(|error| untold(&error))?;
-        loan.write_from_slice(&bytes).send().map_err(|error| untold(&error))?;
+        let unsent =
+            |error: &dyn Debug| Failure::new(Kind::Short, format!("cannot answer a client: {error:?}"), "");
+        let loan = asked.0.loan_slice_uninit(bytes.len()).map_err(|error| unsent(&error))?;
+        loan.write_from_slice(&bytes).send().map_err(|error| unsent(&error))?;
         drop(asked);
-        self.responses.notify().map(drop).map_err(|error| untold(&error))
+        self.responses.notify().map(drop).map_err(|error| unsent(&error))
     }
 }
 
 impl Asked {
-    /// Returns what was asked; nothing if it cannot be read.
+    /// Returns the request, or `None` if it cannot be decoded.
     pub fn request(&self) -> Option<Request> {
         Request::decode(self.0.payload())
     }
 
-    /// Returns whether the client is still there to be told.
+    /// Returns whether the client still waits for the response.
     pub fn is_waited_for(&self) -> bool {
         self.0.is_connected()
     }
 }
 
 impl ControlClient {
-    /// Returns a client's end of the service, or nothing as long as no hub has made it.
+    /// Returns a client's end of the service, or `None` if no hub has created it yet.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if too many clients ask at once, or descriptors are short.
+    /// Returns [`Kind::Short`] if there are too many clients at once, or if descriptors are short.
     pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
         check_descriptors(CONTROL_DESCRIPTORS)?;
         let event = |service: &str| {
@@ -154,9 +156,9 @@ impl ControlClient {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if it cannot be sent; [`Kind::NoHub`] if nobody took it.
+    /// Returns [`Kind::Short`] if it cannot be sent, and [`Kind::NoHub`] if no hub receives it.
     pub fn ask(&self, request: &Request) -> Result<Pending, Failure> {
-        let unsent = |error: &dyn std::fmt::Debug| {
+        let unsent = |error: &dyn Debug| {
             Failure::new(Kind::Short, format!("cannot ask the hub: {error:?}"), "try again later")
         };
         let bytes = request.encode();
@@ -169,33 +171,33 @@ impl ControlClient {
         Ok(Pending(pending))
     }
 
-    /// Returns what is woken by responses, also by those to others.
+    /// Returns the listener that responses wake, including those to other clients.
     pub fn responses(&self) -> &Listener {
         &self.responses
     }
 }
 
 impl Pending {
-    /// Returns the response, or nothing as long as there is none.
+    /// Returns the response, or `None` if it has not arrived.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if it cannot be received or is none.
+    /// Returns [`Kind::Failed`] if it cannot be received or decoded.
     pub fn response(&self) -> Result<Option<Response>, Failure> {
-        let garbled = |error: &dyn std::fmt::Debug| {
+        let garbled = |error: &dyn Debug| {
             Failure::new(Kind::Failed, format!("the hub's answer cannot be read: {error:?}"), "")
         };
         let Some(received) = self.0.receive().map_err(|error| garbled(&error))? else { return Ok(None) };
         Response::decode(received.payload()).map(Some).ok_or_else(|| garbled(&received.payload()))
     }
 
-    /// Returns whether the hub still has the request: it is alive and has not dropped it.
+    /// Returns whether the hub still has the request: it runs and has not dropped it.
     pub fn is_open(&self) -> bool {
         self.0.is_connected()
     }
 }
 
-/// An event of the service, made if it is not there.
+/// Returns an event of the control service, which is created if it does not exist.
 fn bell(node: &Node, service: &str) -> Result<WakeService, Failure> {
     let service = name(service)?;
     create(node, &service, || {
@@ -215,7 +217,7 @@ fn notifier(bell: &WakeService) -> Result<Notifier, Failure> {
     builder.create().map_err(|error| no_port(bell.name(), &error))
 }
 
-/// Bytes that are kept ready for a request: most have no model.
+/// Bytes that are reserved for a request. Most have no model.
 const REQUEST: usize = 64;
-/// The id of both events.
+/// ID of both events.
 const EVENT: usize = 1;

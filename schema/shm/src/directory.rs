@@ -1,27 +1,32 @@
-//! A private directory, such as that of a domain. It is opened component by component from the root of the file system, and
-//! every file in it relative to the open directory. No other user can put another directory in its place.
+//! Private directories of this user: the directory of a domain, and the state directory, which survives restarts. Both
+//! contain small files and locks.
 //!
-//! The last components (base and domain) must belong to this user and be writable by no other user, and a link is never
-//! followed there. Above them, a link is followed if root or this user made it in a directory that no other user can write to:
-//! `/home` or `/var/run` may be links. The owners of the directories above the base are not checked.
+//! A directory is opened component by component from the root of the file system, and every file in it relative to the open
+//! directory. No other user can put another directory in its place. The last components (base and domain) must belong to
+//! this user and be writable by no other user, and a link is never followed there. Above them, a link is followed if root or
+//! this user made it in a directory that no other user can write to: `/home` or `/var/run` may be links. The owners of the
+//! directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
-use std::io::{self, Write};
-use std::os::fd::OwnedFd;
+use std::io::{self, Read, Write};
+use std::os::fd::{AsRawFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
+use nix::fcntl::{FcntlArg, fcntl};
+use nix::libc::{self, flock};
 use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat, fstat, openat, renameat, statat, unlinkat};
 use rustix::io::Errno;
 
 use scanhub_files::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
 use scanhub_schema::{Failure, Kind};
 
+use crate::domain::first_path;
 use crate::shortage;
 
-/// An open directory that this user owns and nobody else can write to.
+/// An open directory that belongs to this user and that no other user can write to.
 #[derive(Debug)]
 pub struct Directory {
     fd: OwnedFd,
@@ -32,58 +37,49 @@ pub struct Directory {
 /// Purpose of a directory, which decides about remedies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Purpose {
-    /// The files of a domain.
+    /// Files of a domain.
     Domain,
     /// Files that programs keep across restarts.
     State,
 }
 
 impl Directory {
-    /// Returns the directory `root` of a domain, or nothing if there is none.
+    /// Returns the directory `root` of a domain, or `None` if it does not exist.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] with the path, its owner and the remedy if base or domain is another user's, can be written to
-    /// by others, or is reached by a link that another user could have made; [`Kind::Short`] if descriptors are.
+    /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can be
+    /// written to by others, or is reached by a link that another user could have made. Returns [`Kind::Short`] if
+    /// descriptors run out.
     pub fn open(root: &Path) -> Result<Option<Directory>, Failure> {
         Directory::walk(root, 2, Purpose::Domain, user(), false)
     }
 
-    /// Opens it as [`open`](Self::open) does; what is missing is made for this user alone.
+    /// Returns the directory `root` of a domain. Missing directories are created for this user only.
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open), and [`Kind::Failed`] if it cannot be created.
+    /// Returns the errors of [`open`](Self::open), and [`Kind::Failed`] if the directory cannot be created.
     pub fn make(root: &Path) -> Result<Directory, Failure> {
-        let made = Directory::walk(root, 2, Purpose::Domain, user(), true)?;
-        made.ok_or_else(|| Purpose::Domain.unusable(root, Errno::NOENT))
+        Directory::made(root, 2, Purpose::Domain)
     }
 
-    /// Opens `path`, where programs keep files across restarts, as [`open`](Self::open) does. This user must own the last
-    /// `own` components.
+    /// Returns the directory `path`, in which programs keep files across restarts. This user must own its last `own`
+    /// components. Missing directories are created for this user only.
     ///
     /// # Errors
     ///
-    /// Those of [`open`](Self::open).
-    pub fn open_state(path: &Path, own: usize) -> Result<Option<Directory>, Failure> {
-        Directory::walk(path, own, Purpose::State, user(), false)
-    }
-
-    /// Opens it as [`open_state`](Self::open_state) does. Missing directories are created for this user alone.
-    ///
-    /// # Errors
-    ///
-    /// Those of [`make`](Self::make).
+    /// Returns the errors of [`make`](Self::make).
     pub fn make_state(path: &Path, own: usize) -> Result<Directory, Failure> {
-        let made = Directory::walk(path, own, Purpose::State, user(), true)?;
-        made.ok_or_else(|| Purpose::State.unusable(path, Errno::NOENT))
+        Directory::made(path, own, Purpose::State)
     }
 
-    /// Returns the file `name`, or nothing if there is none.
+    /// Returns the file `name`, or `None` if it does not exist.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if it is a link, no regular file or another user's; it is not opened then.
+    /// Returns [`Kind::Failed`], and does not open the file, if it is a link, is not a regular file, or belongs to another
+    /// user.
     pub fn file(&self, name: &str) -> Result<Option<File>, Failure> {
         match self.open_file(name, OFlags::RDONLY) {
             Err(Errno::NOENT) => Ok(None),
@@ -91,25 +87,25 @@ impl Directory {
         }
     }
 
-    /// Returns the file `name` to read and write, made with mode 0600 if there is none.
+    /// Returns the file `name` for reading and writing. It is created with mode 0600 if it does not exist.
     ///
     /// # Errors
     ///
-    /// As [`file`](Self::file), and if it cannot be created.
+    /// Returns the errors of [`file`](Self::file), and [`Kind::Failed`] if the file cannot be created.
     pub fn file_or_new(&self, name: &str) -> Result<File, Failure> {
         let opened = self.open_file(name, OFlags::RDWR | OFlags::CREATE);
         self.checked(name, opened)
     }
 
-    /// Replaces the file `name` by `content` in one step: a reader or a crash finds the old or the new one. Waits for the
-    /// disk.
+    /// Replaces the content of the file `name` in one step: a reader, or the next process after a crash, finds the old or
+    /// the new content. Waits for the disk.
     ///
     /// # Errors
     ///
-    /// As [`file_or_new`](Self::file_or_new), and if it cannot be written.
+    /// Returns the errors of [`file_or_new`](Self::file_or_new), and [`Kind::Failed`] if the file cannot be written.
     pub(crate) fn replace(&self, name: &str, content: &[u8]) -> Result<(), Failure> {
         let beside = format!("{name}.new");
-        // A crash may have left one.
+        // A crash may have left such a file.
         self.remove(OsStr::new(&beside));
         let opened = self.open_file(&beside, OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL);
         let mut file = self.checked(&beside, opened)?;
@@ -130,7 +126,7 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// The system's error if it stays.
+    /// Returns the system's error if it cannot be removed.
     pub(crate) fn try_remove(&self, name: &OsStr) -> io::Result<()> {
         match unlinkat(&self.fd, name, AtFlags::empty()) {
             Ok(()) | Err(Errno::NOENT) => Ok(()),
@@ -143,20 +139,16 @@ impl Directory {
         let _ = unlinkat(&self.fd, name, AtFlags::REMOVEDIR);
     }
 
-    /// Its entries: names and types, links as links.
+    /// Returns the names and the metadata of the directory's entries. Links are not followed.
     pub(crate) fn entries(&self) -> Vec<(OsString, Stat)> {
         let Ok(entries) = Dir::read_from(&self.fd) else { return Vec::new() };
-        let names = entries.filter_map(|entry| {
-            let name = OsStr::from_bytes(entry.ok()?.file_name().to_bytes()).to_owned();
-            (name != "." && name != "..").then_some(name)
-        });
-        names
-            .filter_map(|name| Some((statat(&self.fd, &name, AtFlags::SYMLINK_NOFOLLOW).ok()?, name)))
-            .map(|(stat, name)| (name, stat))
-            .collect()
+        let names = entries.flatten().map(|entry| OsStr::from_bytes(entry.file_name().to_bytes()).to_owned());
+        let with_metadata = |name| Some((statat(&self.fd, &name, AtFlags::SYMLINK_NOFOLLOW).ok()?, name));
+        let entries = names.filter(|name| name != "." && name != "..").filter_map(with_metadata);
+        entries.map(|(stat, name)| (name, stat)).collect()
     }
 
-    /// The directory `name` in it, unless that is a link or another user's.
+    /// Returns the directory `name` in this one. `None` if it does not exist, is a link, or belongs to another user.
     pub(crate) fn below(&self, name: &str) -> Option<Directory> {
         let how = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
         let fd = openat(&self.fd, name, how, Mode::empty()).ok()?;
@@ -164,7 +156,7 @@ impl Directory {
         is_own.then(|| Directory { fd, path: self.path.join(name), purpose: self.purpose })
     }
 
-    /// Removes it, if it is empty and still at its place; returns whether it is gone.
+    /// Removes the directory if it is empty and still has its path. Returns whether it is removed.
     pub(crate) fn remove_itself(&self) -> bool {
         let there = self.path.symlink_metadata().map(|it| (it.dev(), it.ino()));
         let is_here =
@@ -197,7 +189,12 @@ impl Directory {
         Ok(File::from(fd))
     }
 
-    /// Opens `path`. `user` must own its last `own` components.
+    fn made(path: &Path, own: usize, purpose: Purpose) -> Result<Directory, Failure> {
+        let made = Directory::walk(path, own, purpose, user(), true)?;
+        made.ok_or_else(|| purpose.unusable(path, Errno::NOENT))
+    }
+
+    /// Opens `path`, whose last `own` components must belong to `user`.
     fn walk(
         path: &Path,
         own: usize,
@@ -217,7 +214,7 @@ impl Directory {
                 return Ok(None);
             }
             for (number, component) in owned.iter().enumerate() {
-                // The domain's own directory is read, the others are only passed.
+                // Only the directory itself is read.
                 let how = if number + 1 == own { OFlags::RDONLY } else { OFlags::PATH };
                 if !walk.enter_own(component, make, how)? {
                     return Ok(None);
@@ -231,7 +228,7 @@ impl Directory {
 }
 
 impl Purpose {
-    /// Returns what to tell `user` of `error`.
+    /// Returns the failure to report to `user` for `error`.
     fn failure(self, error: WalkError, user: u32) -> Failure {
         match error {
             WalkError::System(path, error) => self.unusable(&path, error),
@@ -295,5 +292,459 @@ impl Purpose {
 
 const SET_STATE: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
 
+/// A lock on a file of a domain's directory. It ends with its process. The file has the ID of the process, because the kernel
+/// does not report it.
+#[derive(Debug)]
+pub(crate) struct FileLock {
+    file: File,
+}
+
+impl FileLock {
+    /// Takes the lock on the file `name` in `root`, and clears the file. Creates directory and file if they do not
+    /// exist.
+    ///
+    /// # Errors
+    ///
+    /// Returns the failure `held` if another process has the lock. Its argument is the ID of that process, or 0 if the
+    /// process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
+    pub(crate) fn acquire(
+        root: &Path,
+        name: &str,
+        held: impl Fn(u32) -> Failure,
+    ) -> Result<FileLock, Failure> {
+        let file = loop {
+            let file = Directory::make(root)?.file_or_new(name)?;
+            match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
+                // The previous holder may have removed the domain, and the next one would lock another file.
+                Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
+                Ok(_) => break file,
+                Err(nix::Error::EAGAIN | nix::Error::EACCES) => return Err(held(pid_in(&file))),
+                Err(error) => return Err(Purpose::Domain.unusable(root, error)),
+            }
+        };
+        file.set_len(0).map_err(|error| Purpose::Domain.unusable(root, error))?;
+        Ok(FileLock { file })
+    }
+
+    /// Writes `lines` at the start of the file, which is in `root`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if the file cannot be written.
+    pub(crate) fn write(&self, root: &Path, lines: &str) -> Result<(), Failure> {
+        self.file.write_all_at(lines.as_bytes(), 0).map_err(|error| Purpose::Domain.unusable(root, error))
+    }
+}
+
+impl Drop for FileLock {
+    /// Closing is not enough: a process that is just being started has a copy of the descriptor for a moment.
+    fn drop(&mut self) {
+        let _ = fcntl(self.file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_UNLCK)));
+    }
+}
+
+/// Lock of a process that creates services in a domain, or removes unfinished ones.
+pub(crate) struct MakingLock {
+    _lock: FileLock,
+}
+
+impl MakingLock {
+    /// Waits for the lock. A process holds it only while it creates one service.
+    pub(crate) fn wait(root: &Path) -> Result<MakingLock, Failure> {
+        let file = Directory::make(root)?.file_or_new(MAKING)?;
+        loop {
+            match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLKW(&whole_file(libc::F_WRLCK))) {
+                Ok(_) => return Ok(MakingLock { _lock: FileLock { file } }),
+                Err(nix::Error::EINTR) => {}
+                Err(error) => return Err(Purpose::Domain.unusable(root, error)),
+            }
+        }
+    }
+}
+
+/// Returns the file of the lock `name` and its directory if a process holds the lock.
+///
+/// # Errors
+///
+/// Returns the errors of [`Directory::open`] and [`Directory::file`].
+pub(crate) fn held_file(root: &Path, name: &str) -> Result<Option<(Directory, File)>, Failure> {
+    let Some(directory) = Directory::open(root)? else { return Ok(None) };
+    let Some(file) = directory.file(name)? else { return Ok(None) };
+    let mut lock = whole_file(libc::F_RDLCK);
+    fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
+        .map_err(|error| Purpose::Domain.unusable(root, error))?;
+    Ok((lock.l_type != libc::F_UNLCK as libc::c_short).then_some((directory, file)))
+}
+
+/// Returns the process ID in the file of a lock; 0 if it has none.
+pub(crate) fn pid_in(file: &File) -> u32 {
+    content(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
+}
+
+/// Returns the text in the file of a lock.
+pub(crate) fn content(file: &File) -> String {
+    let mut bytes = [0; 32];
+    let length = file.read_at(&mut bytes, 0).unwrap_or_default();
+    String::from_utf8_lossy(&bytes[..length]).into_owned()
+}
+
+/// Returns a lock of the whole file. `l_pid` must be 0 for open file descriptions.
+fn whole_file(kind: libc::c_int) -> flock {
+    flock {
+        l_type: kind as libc::c_short,
+        l_whence: libc::SEEK_SET as libc::c_short,
+        l_start: 0,
+        l_len: 0,
+        l_pid: 0,
+    }
+}
+
+const MAKING: &str = "making.lock";
+
+/// Directory of the small text files that a domain keeps across restarts: `$STATE_DIRECTORY/DOMAIN`, otherwise
+/// `$XDG_STATE_HOME/scanhub/DOMAIN`, otherwise `~/.local/state/scanhub/DOMAIN`.
+///
+/// The reader of a file checks its content, which may come from another version or be missing. Losing a file only costs
+/// time.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StateDirectory {
+    path: PathBuf,
+}
+
+impl StateDirectory {
+    /// Returns the directory above those of all domains, which the environment of this process names: the one that systemd
+    /// created for the service, otherwise the user's own. `None` if the environment names no directory.
+    pub fn base() -> Option<PathBuf> {
+        base_in(|name| std::env::var_os(name))
+    }
+
+    /// Returns the directory of `domain`, which need not exist; `None` as for [`base`](Self::base).
+    pub fn of_domain(domain: &str) -> Option<StateDirectory> {
+        Some(StateDirectory::at(StateDirectory::base()?.join(domain)))
+    }
+
+    /// Returns the directory `path`, which need not exist.
+    pub fn at(path: impl Into<PathBuf>) -> StateDirectory {
+        StateDirectory { path: path.into() }
+    }
+
+    /// Returns the path of the file `name`, which need not exist.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// Checks that the directory can be used, if it exists.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the one above it, belongs to another user, can be
+    /// written to by others, or is reached by a link that another user could have made.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.open().map(drop)
+    }
+
+    /// Returns the content of the file `name`, or `None` if it does not exist.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`check`](Self::check). Returns [`Kind::Failed`] if the file cannot be read, is not a regular file
+    /// of this user that no other user can write, has more than `most` bytes, or is not UTF-8.
+    pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
+        let Some(directory) = self.open()? else { return Ok(None) };
+        let Some(file) = directory.file(name)? else { return Ok(None) };
+        read(&file, most).map(Some).map_err(|error| {
+            let what = format!("cannot use {}: {error}", self.path(name).display());
+            Failure::new(Kind::Failed, what, "delete it; its content is learned again")
+        })
+    }
+
+    /// Replaces the content of the file `name`, which gets mode 0600. Creates the directory with mode 0700 if it does not
+    /// exist. Waits for the disk, so do not call it in a thread that reads a line.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. It then keeps its
+    /// content.
+    pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+        self.make()?.replace(name, text.as_bytes()).map_err(unkept)
+    }
+
+    /// Waits for the lock that a process holds between reading and writing the file `name`, and returns it. The lock ends when
+    /// it is dropped. Creates the directory as [`write`](Self::write) does, and a file for the lock.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`write`](Self::write).
+    pub fn lock(&self, name: &str) -> Result<File, Failure> {
+        let name = format!("{name}.lock");
+        let file = self.make()?.file_or_new(&name).map_err(unkept)?;
+        let locked = file.lock().map(|()| file);
+        locked.map_err(|error| {
+            let what = format!("cannot lock {}: {error}", self.path(&name).display());
+            Failure::new(Kind::Failed, what, "the file system must have locks")
+        })
+    }
+
+    /// Removes the file `name`, if it exists.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be removed.
+    pub fn remove(&self, name: &str) -> Result<(), Failure> {
+        let Some(directory) = self.open()? else { return Ok(()) };
+        directory.try_remove(OsStr::new(name)).map_err(|error| {
+            let message = format!("{}: an old file stays: {error}", self.path(name).display());
+            Failure::new(Kind::Failed, message, "remove the file")
+        })
+    }
+
+    fn open(&self) -> Result<Option<Directory>, Failure> {
+        Directory::walk(&self.path, OWN, Purpose::State, user(), false)
+    }
+
+    fn make(&self) -> Result<Directory, Failure> {
+        Directory::make_state(&self.path, OWN).map_err(unkept)
+    }
+}
+
+/// The directory of the domain, and the one of all domains above it.
+const OWN: usize = 2;
+
+/// Adds to the message that nothing can be kept.
+fn unkept(failure: Failure) -> Failure {
+    Failure { message: format!("nothing can be kept: {}", failure.message), ..failure }
+}
+
+fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let path = |name| variable(name).and_then(first_path);
+    let user = || path("XDG_STATE_HOME").or_else(|| Some(path("HOME")?.join(".local/state")));
+    path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub")))
+}
+
+fn read(file: &File, most: u64) -> io::Result<String> {
+    let refused = |what| io::Error::new(io::ErrorKind::InvalidData, what);
+    let metadata = file.metadata()?;
+    let (owner, mode) = (metadata.uid(), metadata.mode() & 0o7777);
+    if mode & 0o022 != 0 {
+        return Err(refused(format!("others can write it: owner {owner}, mode {mode:04o}")));
+    }
+    let mut text = String::new();
+    let len = file.take(most + 1).read_to_string(&mut text)?;
+    if len as u64 > most { Err(refused(format!("it has more than {most} bytes"))) } else { Ok(text) }
+}
+
 #[cfg(test)]
-mod tests;
+mod tests {
+    use std::fs::{self, Permissions};
+    use std::os::unix::fs::{PermissionsExt, symlink};
+
+    use tempfile::TempDir;
+
+    use super::*;
+
+    /// `HERE/base/domain`, each with mode 0700.
+    struct Here(TempDir);
+
+    impl Here {
+        fn new() -> Here {
+            let here = Here(TempDir::new().unwrap());
+            Directory::make(&here.at("base/domain")).unwrap();
+            here
+        }
+
+        fn at(&self, path: &str) -> PathBuf {
+            self.0.path().join(path)
+        }
+
+        fn mode(&self, path: &str, mode: u32) {
+            fs::set_permissions(self.at(path), Permissions::from_mode(mode)).unwrap();
+        }
+    }
+
+    fn refusal(opened: Result<Option<Directory>, Failure>) -> String {
+        let failure = opened.expect_err("it is refused");
+        assert!(!failure.hint.is_empty());
+        failure.message
+    }
+
+    #[test]
+    fn what_is_missing_is_nothing_or_made_for_this_user_alone() {
+        let here = Here::new();
+        assert!(Directory::open(&here.at("base/domain")).unwrap().is_some());
+        for absent in ["base/other", "other/domain", "a/b/c"] {
+            assert!(Directory::open(&here.at(absent)).unwrap().is_none(), "{absent}");
+        }
+        Directory::make(&here.at("a/b/c")).unwrap();
+        for made in ["a", "a/b", "a/b/c"] {
+            assert_eq!(fs::metadata(here.at(made)).unwrap().permissions().mode() & 0o7777, 0o700, "{made}");
+        }
+    }
+
+    #[test]
+    fn base_and_domain_are_this_users_alone() {
+        let here = Here::new();
+        let path = here.at("base/domain");
+        let own = user();
+        let said = refusal(Directory::walk(&path, 2, Purpose::Domain, own + 1, false));
+        assert!(said.starts_with(&format!("{} belongs to user {own}", here.at("base").display())), "{said}");
+        assert!(said.contains("with mode 0700, this is user"), "{said}");
+        for open in ["base", "base/domain"] {
+            for mode in [0o720, 0o702, 0o1777] {
+                here.mode(open, mode);
+                let said = refusal(Directory::open(&path));
+                assert!(
+                    said.starts_with(&format!("{} has mode {mode:04o}", here.at(open).display())),
+                    "{said}"
+                );
+                let hint = Directory::open(&path).unwrap_err().hint;
+                assert_eq!(hint.contains("chmod go-w"), mode & STICKY == 0, "{hint}");
+            }
+            here.mode(open, 0o755);
+        }
+        assert!(Directory::open(&path).unwrap().is_some(), "others may look");
+    }
+
+    #[test]
+    fn links_are_followed_above_the_base_where_nobody_else_makes_them() {
+        let here = Here::new();
+        symlink(here.at("base"), here.at("link")).unwrap();
+        symlink("domain", here.at("base/alias")).unwrap();
+        for (path, link) in [("link/domain", "link"), ("base/alias", "base/alias")] {
+            let said = refusal(Directory::open(&here.at(path)));
+            assert!(said.starts_with(&format!("{} is a link", here.at(link).display())), "{said}");
+        }
+        Directory::make(&here.at("base/x/domain")).unwrap();
+        assert!(Directory::open(&here.at("link/x/domain")).unwrap().is_some());
+        here.mode("", 0o1777);
+        let said = refusal(Directory::open(&here.at("link/x/domain")));
+        assert!(said.contains("is a link of user") && said.contains("mode 1777"), "{said}");
+        here.mode("", 0o700);
+        // For another user, only links of root are followed.
+        if user() != 0 {
+            let said =
+                refusal(Directory::walk(&here.at("link/x/domain"), 2, Purpose::Domain, user() + 1, false));
+            assert!(said.contains("is a link of user"), "{said}");
+        }
+        symlink("circle", here.at("circle")).unwrap();
+        assert!(Directory::open(&here.at("circle/x/domain")).is_err());
+        fs::write(here.at("file"), "").unwrap();
+        assert!(Directory::open(&here.at("file/x/domain")).is_err());
+    }
+
+    #[test]
+    fn files_are_regular_ones() {
+        let here = Here::new();
+        let directory = Directory::make(&here.at("base/domain")).unwrap();
+        assert!(directory.file("hub.lock").unwrap().is_none());
+        directory.file_or_new("hub.lock").unwrap();
+        let mode = fs::metadata(here.at("base/domain/hub.lock")).unwrap().permissions().mode();
+        assert_eq!(mode & 0o7777, 0o600);
+        assert!(directory.file("hub.lock").unwrap().is_some());
+        fs::write(here.at("victim"), "whole").unwrap();
+        symlink(here.at("victim"), here.at("base/domain/link")).unwrap();
+        symlink(here.at("victim"), here.at("base/domain/prefix.new")).unwrap();
+        let fifo = here.at("base/domain/fifo");
+        rustix::fs::mknodat(rustix::fs::CWD, &fifo, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+        for (name, word) in [("link", "is a link"), ("fifo", "is no regular file")] {
+            for failure in [directory.file(name).unwrap_err(), directory.file_or_new(name).unwrap_err()] {
+                assert!(failure.message.contains(word), "{name}: {failure}");
+            }
+        }
+        directory.replace("prefix", b"x").unwrap();
+        assert_eq!(fs::read_to_string(here.at("base/domain/prefix")).unwrap(), "x");
+        assert_eq!(fs::read_to_string(here.at("victim")).unwrap(), "whole");
+    }
+
+    /// Path of a directory that does not exist yet, below a temporary one.
+    struct Place(PathBuf, #[expect(dead_code, reason = "it is removed when it is dropped")] TempDir);
+
+    impl Place {
+        fn new() -> (Place, StateDirectory) {
+            let parent = TempDir::new().unwrap();
+            let path = parent.path().join("a");
+            (Place(path.clone(), parent), StateDirectory::at(path))
+        }
+    }
+
+    fn mode(path: &Path) -> u32 {
+        fs::metadata(path).unwrap().mode() & 0o7777
+    }
+
+    #[test]
+    fn the_environment_says_where() {
+        let base = |set: &[(&str, &str)]| {
+            base_in(|name| set.iter().find(|(key, _)| *key == name).map(|(_, value)| value.into()))
+        };
+        let [service, user, home] =
+            [("STATE_DIRECTORY", "/s/a:/s/b"), ("XDG_STATE_HOME", "/x"), ("HOME", "/h")];
+        assert_eq!(base(&[service, user, home]), Some("/s/a".into()));
+        assert_eq!(base(&[user, home]), Some("/x/scanhub".into()));
+        assert_eq!(base(&[home]), Some("/h/.local/state/scanhub".into()));
+        assert_eq!(base(&[("XDG_STATE_HOME", "relative"), home]), Some("/h/.local/state/scanhub".into()));
+        assert_eq!(base(&[]), None);
+    }
+
+    #[test]
+    fn what_was_written_is_read_by_this_user_alone() {
+        let (place, state) = Place::new();
+        assert_eq!(state.read("f", 9), Ok(None));
+        for text in ["first", "second", ""] {
+            state.write("f", text).unwrap();
+            assert_eq!(state.read("f", 6), Ok(Some(text.to_owned())));
+            assert_eq!((mode(&place.0), mode(&state.path("f"))), (0o700, 0o600));
+        }
+        assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");
+    }
+
+    #[test]
+    fn what_a_crash_left_is_replaced() {
+        let (place, state) = Place::new();
+        fs::create_dir_all(&place.0).unwrap();
+        let other = place.0.join("other");
+        fs::write(&other, "untouched").unwrap();
+        symlink(&other, state.path("f.new")).unwrap();
+        state.write("f", "text").unwrap();
+        assert_eq!(state.read("f", 9), Ok(Some("text".to_owned())));
+        assert_eq!(fs::read_to_string(&other).unwrap(), "untouched");
+        assert_eq!(mode(&state.path("f")), 0o600);
+    }
+
+    #[test]
+    fn what_is_not_ours_is_not_believed() {
+        let (place, state) = Place::new();
+        state.write("f", "12345").unwrap();
+        let refused = |state: &StateDirectory, name, says: &str| {
+            let failure = state.read(name, 5).unwrap_err();
+            assert!(failure.message.contains(says) && failure.message.contains("/a/"), "{failure}");
+            assert!(failure.hint.contains("delete it") || failure.hint.contains("remove it"), "{failure}");
+        };
+        fs::write(state.path("long"), "123456").unwrap();
+        refused(&state, "long", "more than 5 bytes");
+        fs::write(state.path("binary"), [0xff]).unwrap();
+        refused(&state, "binary", "UTF-8");
+        symlink(state.path("f"), state.path("link")).unwrap();
+        refused(&state, "link", "is a link");
+        fs::create_dir(state.path("directory")).unwrap();
+        refused(&state, "directory", "no regular file");
+        fs::set_permissions(state.path("f"), fs::Permissions::from_mode(0o620)).unwrap();
+        refused(&state, "f", "mode 0620");
+        drop(place);
+    }
+
+    #[test]
+    fn where_nothing_can_be_written_the_remedy_is_told() {
+        let state = StateDirectory::at("/dev/null/x");
+        let failures = [state.read("f", 9).map(drop).unwrap_err(), state.write("f", "text").unwrap_err()];
+        let [_, failure] = failures;
+        assert!(failure.message.contains("nothing can be kept: /dev/null"), "{failure}");
+        assert!(failure.hint.contains("STATE_DIRECTORY"), "{failure}");
+    }
+
+    #[test]
+    fn a_name_that_is_taken_by_a_directory_stays_as_it_is() {
+        let (place, state) = Place::new();
+        fs::create_dir_all(state.path("f").join("full")).unwrap();
+        state.write("f", "text").unwrap_err();
+        assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");
+    }
+}

@@ -1,6 +1,12 @@
-//! Where the shared memory of one hub is: a root directory and a prefix that no other hub shares. Pure: it lists the
-//! possible places in their order; refuses to check whether a hub runs there.
+//! Domains: the locations in which the shared memory of a hub may be, and the hubs that run on this machine.
+//!
+//! [`Domain`] and [`Environment`] only compute locations, in the order in which clients search them. [`RunningHub`] finds
+//! the hubs of all users, as /proc shows them. Shared memory is for one user, so a client of another user finds no hub.
+//! Its message then names the user whose hub runs, and the command that reaches it.
 
+use std::ffi::{OsStr, OsString};
+use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 use scanhub_schema::{Failure, Kind};
@@ -8,17 +14,17 @@ use scanhub_schema::{Failure, Kind};
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
-/// Root and prefix, with its random part, stay below this many bytes: the path of a listener's socket, 107 bytes at most
-/// (unix(7)), has a number of up to 35 digits and 7 bytes besides.
+/// Root and prefix, with its random part, must have fewer bytes than this. The path of a listener's socket has at most 107
+/// bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
 const PLACE_LIMIT: usize = 66;
 
-/// Bytes that a domain's directory adds to the prefix (`prefix.rs`): five random letters, and `_`.
+/// Bytes that are added to the prefix (`segments.rs`): five random letters, and `_`.
 const RANDOM: usize = 6;
 
-/// What systemd makes for the service; clients outside of the service look there too.
+/// Directory that systemd creates for the service. Clients outside of the service search it too.
 const SERVICE_BASE: &str = "/run/scanhub";
 
-/// A domain at its place.
+/// A domain at its location.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Domain {
     name: String,
@@ -26,11 +32,11 @@ pub struct Domain {
 }
 
 impl Domain {
-    /// Returns domain `name` below the directory `base` (`--root`); a relative one counts from the working directory.
+    /// Returns domain `name` below the directory `base` (`--root`), which may be relative to the working directory.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] if the name is not possible, or root and prefix are too long together.
+    /// Returns [`Kind::Configuration`] if the name is not valid, or if root and prefix together are too long.
     pub fn at(name: &str, base: &Path) -> Result<Domain, Failure> {
         check_name(name)?;
         let base = std::path::absolute(base).unwrap_or_else(|_| base.to_owned());
@@ -51,22 +57,23 @@ impl Domain {
         ))
     }
 
-    /// Returns where a hub puts domain `name`: below `base` if given, else the first place that the environment offers.
+    /// Returns the location in which a hub creates domain `name`: below `base` if it is given, otherwise in the first
+    /// directory that the environment names.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] as [`Domain::at`].
+    /// Returns the errors of [`Domain::at`].
     pub fn of_hub(name: &str, base: Option<&Path>, environment: &Environment) -> Result<Domain, Failure> {
         let base = base.map_or_else(|| environment.base_of_hub(), Path::to_owned);
         Domain::at(name, &base)
     }
 
-    /// Returns where a client looks for domain `name`: below `base` only if given, else every place that a hub may have
-    /// chosen, in order; the first one that is live is taken. Places that are too long for a hub are left out.
+    /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if it is given,
+    /// otherwise in each directory that a hub may have chosen. Locations that are too long for a hub are left out.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] as [`Domain::at`].
+    /// Returns the errors of [`Domain::at`].
     pub fn candidates(
         name: &str,
         base: Option<&Path>,
@@ -78,9 +85,10 @@ impl Domain {
         }
         let mut domains = Vec::new();
         for base in environment.bases() {
-            match Domain::at(name, &base) {
-                Ok(domain) if !domains.contains(&domain) => domains.push(domain),
-                _ => {}
+            if let Ok(domain) = Domain::at(name, &base)
+                && !domains.contains(&domain)
+            {
+                domains.push(domain);
             }
         }
         Ok(domains)
@@ -91,41 +99,45 @@ impl Domain {
         &self.name
     }
 
-    /// Returns the directory of all its files, the lock among them.
+    /// Returns the directory of the domain's files, such as its locks.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Returns how the names of its shared memory begin; what follows is in the directory's file `prefix`.
+    /// Returns the start of the names of its shared memory. The rest of the prefix is in the directory's file `prefix`.
     pub fn prefix(&self) -> String {
         format!("sh_{}_", self.name)
     }
 }
 
-/// The variables of the process's environment that name places.
+/// Variables of a process's environment that name locations, and its user.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Environment {
-    /// RUNTIME_DIRECTORY: set for the service, by systemd.
+    /// RUNTIME_DIRECTORY, which systemd sets for the service.
     pub runtime_directory: Option<PathBuf>,
-    /// XDG_RUNTIME_DIR: set for a user who has logged in.
+    /// XDG_RUNTIME_DIR, which is set in a login session.
     pub xdg_runtime_dir: Option<PathBuf>,
-    /// The user's number.
+    /// User ID.
     pub uid: u32,
 }
 
 impl Environment {
     /// Returns the environment of this process.
     pub fn of_process() -> Environment {
-        let path = |name| std::env::var_os(name).and_then(first_path);
+        Environment::of(|name| std::env::var_os(name), rustix::process::getuid().as_raw())
+    }
+
+    fn of(variable: impl Fn(&str) -> Option<OsString>, uid: u32) -> Environment {
+        let path = |name| variable(name).and_then(first_path);
         Environment {
             runtime_directory: path("RUNTIME_DIRECTORY"),
             xdg_runtime_dir: path("XDG_RUNTIME_DIR"),
-            uid: rustix::process::getuid().as_raw(),
+            uid,
         }
     }
 
-    /// Returns every directory that may hold domains, in the order in which clients look. A hub of a login session is found
-    /// even from outside of it: sudo, ssh and cron do not set XDG_RUNTIME_DIR.
+    /// Returns every directory that may contain domains, in the order in which clients search. It contains the directory of
+    /// the login session even without XDG_RUNTIME_DIR, which sudo, ssh and cron do not set.
     pub fn bases(&self) -> Vec<PathBuf> {
         let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
         bases.push(SERVICE_BASE.into());
@@ -136,8 +148,8 @@ impl Environment {
         bases
     }
 
-    /// Returns the directory that a hub with this environment puts its domain into.
-    pub(crate) fn base_of_hub(&self) -> PathBuf {
+    /// Returns the directory in which a hub with this environment creates its domain.
+    fn base_of_hub(&self) -> PathBuf {
         match (&self.runtime_directory, &self.xdg_runtime_dir) {
             (Some(service), _) => service.clone(),
             (None, Some(user)) => user.join("scanhub"),
@@ -150,8 +162,171 @@ impl Environment {
     }
 }
 
-/// Refuses a domain's name that is not `[a-z0-9-]{1,16}`.
-pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
+/// A process that runs a hub: `scanhub run` or `scanhub replay`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunningHub {
+    /// Process ID.
+    pub pid: u32,
+    /// ID of the user that it runs as.
+    pub uid: u32,
+    /// Name of that user; `#` and the ID, as `sudo -u` takes it, if the user has no name.
+    pub user: String,
+    /// Domain of the hub. `None` if only its environment may say, which other users cannot read.
+    pub domain: Option<String>,
+    /// Directory that contains its domain. `None` if only its environment says, which other users cannot read.
+    pub base: Option<PathBuf>,
+    /// The program, as it was started.
+    program: String,
+}
+
+impl RunningHub {
+    /// Returns the hubs on the machine whose files are below `root`, by process ID. Processes that this user may not see
+    /// are missing.
+    pub fn all(root: &Path) -> Vec<RunningHub> {
+        let users = fs::read_to_string(root.join("etc/passwd")).unwrap_or_default();
+        let processes = fs::read_dir(root.join("proc")).into_iter().flatten().flatten();
+        let mut hubs: Vec<RunningHub> = processes
+            .filter_map(|process| {
+                let pid = process.file_name().to_str()?.parse().ok()?;
+                RunningHub::of_process(&process.path(), pid, &users)
+            })
+            .collect();
+        hubs.sort_by_key(|hub| hub.pid);
+        hubs
+    }
+
+    /// Returns the hub that the process at `path` runs.
+    fn of_process(path: &Path, pid: u32, users: &str) -> Option<RunningHub> {
+        let text = |name: &str| fs::read_to_string(path.join(name)).ok();
+        if text("comm")?.trim_end() != "scanhub" {
+            return None;
+        }
+        let command_line = fs::read(path.join("cmdline")).ok()?;
+        let command = CommandLine::parse(&command_line)?;
+        let uid = text("status")?.lines().find_map(|line| line.strip_prefix("Uid:"))?.to_owned();
+        let uid: u32 = uid.split_whitespace().next()?.parse().ok()?;
+        let entry = users.lines().find(|line| line.split(':').nth(2) == Some(&uid.to_string()));
+        let user = entry.and_then(|entry| entry.split(':').next());
+        let user = user.map_or_else(|| format!("#{uid}"), str::to_owned);
+        let environment = fs::read(path.join("environ")).ok();
+        let variable = |name: &str| {
+            let mut all = environment.as_deref().unwrap_or_default().split(|&byte| byte == 0);
+            let value = all.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
+            (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
+        };
+        let base = match command.root {
+            // A relative one counts from the process's working directory, which other users cannot read.
+            Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
+            None => environment.is_some().then(|| Environment::of(variable, uid).base_of_hub()),
+        };
+        let domain = command.domain.or_else(|| variable("SCANHUB_DOMAIN")?.into_string().ok());
+        let domain = domain.or_else(|| environment.is_some().then(|| DEFAULT_DOMAIN.to_owned()));
+        // Any user can start a process with any command line, and the name becomes part of a suggested command.
+        if let Some(domain) = &domain {
+            check_name(domain).ok()?;
+        }
+        // A relative path counts from the process's working directory.
+        let program = if command.program.contains('/') && !command.program.starts_with('/') {
+            let directory = fs::read_link(path.join("cwd"));
+            directory.map_or("scanhub".to_owned(), |it| it.join(&command.program).display().to_string())
+        } else {
+            command.program
+        };
+        Some(RunningHub { pid, uid, user, domain, base, program })
+    }
+
+    /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that has asked for `domain`.
+    pub fn whereabouts(&self, verb: &str, domain: &str, caller: &Environment) -> String {
+        let whose =
+            if self.uid == caller.uid { "this user".to_owned() } else { format!("user {}", self.user) };
+        let of_domain = match &self.domain {
+            Some(own) if own == domain => String::new(),
+            Some(own) => format!(" in domain {own}"),
+            None => " in an unknown domain".to_owned(),
+        };
+        format!("{whose} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
+    }
+
+    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one that
+    /// the caller has asked for. If the hub's domain is unknown, the command lists the domains of the hub's user.
+    pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
+        // sudo resets the environment of the command.
+        let (sudo, environment, domain) = if self.uid == caller.uid {
+            (String::new(), caller.clone(), domain)
+        } else {
+            let sudo = if self.uid == 0 {
+                "sudo ".to_owned()
+            } else {
+                format!("sudo -u {} ", shell_word(&self.user))
+            };
+            (sudo, Environment { uid: self.uid, ..Environment::default() }, DEFAULT_DOMAIN)
+        };
+        let program = shell_word(&self.program);
+        let Some(own) = &self.domain else { return format!("{sudo}{program} list --domains") };
+        let mut command = format!("{sudo}{program} {verb}");
+        if own != domain {
+            command += &format!(" --domain {own}");
+        }
+        if let Some(base) = self.base.as_ref().filter(|base| !environment.bases().contains(base)) {
+            command += &format!(" --root {}", shell_word(&base.to_string_lossy()));
+        }
+        command
+    }
+}
+
+/// Command line of a hub.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct CommandLine {
+    program: String,
+    domain: Option<String>,
+    root: Option<PathBuf>,
+}
+
+impl CommandLine {
+    /// Parses `/proc/PID/cmdline`; `None` if it does not start a hub.
+    fn parse(bytes: &[u8]) -> Option<CommandLine> {
+        let text = bytes.strip_suffix(&[0]).unwrap_or(bytes);
+        let mut words = text.split(|&byte| byte == 0).map(|word| String::from_utf8_lossy(word));
+        let program = Path::new(&*words.next()?).to_owned();
+        // A program on the usual path needs no directory.
+        let is_usual =
+            program.parent().is_some_and(|directory| USUAL.iter().any(|usual| directory == Path::new(usual)));
+        let name = if is_usual { program.file_name()?.into() } else { program.into_os_string() };
+        let mut command = CommandLine { program: name.into_string().ok()?, ..CommandLine::default() };
+        let mut verb = None;
+        while let Some(word) = words.next() {
+            let (flag, mut value) = match word.split_once('=') {
+                Some((flag, value)) => (flag, Some(value.to_owned())),
+                None => (&*word, None),
+            };
+            if ["--domain", "--root"].contains(&flag) && value.is_none() {
+                value = words.next().map(|value| value.into_owned());
+            }
+            match flag {
+                "--domain" => command.domain = value,
+                "--root" => command.root = value.map(PathBuf::from),
+                _ if !word.starts_with('-') && verb.is_none() => verb = Some(word.into_owned()),
+                _ => {}
+            }
+        }
+        ["run", "replay"].contains(&verb?.as_str()).then_some(command)
+    }
+}
+
+/// Returns `word` as one word of a shell. Brackets, which zsh expands, blanks and an empty word need quotes.
+pub fn shell_word(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,=".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+/// Directories that sudo looks for programs in (sudoers(5), `secure_path`).
+const USUAL: [&str; 6] = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
+
+/// Checks that a domain's name is `[a-z0-9-]{1,16}`.
+fn check_name(name: &str) -> Result<(), Failure> {
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
     if (1..=16).contains(&name.len()) && name.chars().all(allowed) {
         return Ok(());
@@ -163,8 +338,8 @@ pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
     ))
 }
 
-/// The first of a colon-separated list (systemd lists several runtime directories so), if it is absolute.
-pub(crate) fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
+/// Returns the first path of a colon-separated list, if it is absolute. systemd may list several runtime directories.
+pub(crate) fn first_path(value: OsString) -> Option<PathBuf> {
     let text = value.into_string().ok()?;
     let first = PathBuf::from(text.split(':').next()?);
     first.is_absolute().then_some(first)
@@ -172,6 +347,8 @@ pub(crate) fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
 
 #[cfg(test)]
 mod tests {
+    use tempfile::TempDir;
+
     use super::*;
 
     fn environment(service: Option<&str>, user: Option<&str>) -> Environment {
@@ -231,5 +408,104 @@ mod tests {
     fn the_first_of_several_directories_counts() {
         assert_eq!(first_path("/run/a:/run/b".into()), Some("/run/a".into()));
         assert_eq!(first_path("relative".into()), None);
+    }
+
+    const PASSWD: &str = "root:x:0:0:root:/root:/bin/sh\nscanhub:x:998:997::/:/usr/sbin/nologin\nalice:x:1000:1000::/home/alice:/bin/sh\n";
+
+    /// A made-up machine: files below a temporary directory.
+    struct Machine(TempDir);
+
+    impl Machine {
+        fn new() -> Machine {
+            let root = TempDir::new().unwrap();
+            fs::create_dir(root.path().join("etc")).unwrap();
+            fs::write(root.path().join("etc/passwd"), PASSWD).unwrap();
+            Machine(root)
+        }
+
+        /// Adds a process; other users cannot read an environment of `None`.
+        fn process(&self, pid: u32, uid: u32, command: &[&str], environment: Option<&str>) {
+            let path = self.0.path().join(format!("proc/{pid}"));
+            fs::create_dir_all(&path).unwrap();
+            let program = command.first().and_then(|program| program.rsplit('/').next()).unwrap_or("sh");
+            fs::write(path.join("comm"), format!("{program}\n")).unwrap();
+            fs::write(path.join("status"), format!("Name:\t{program}\nUid:\t{uid}\t{uid}\t{uid}\t{uid}\n"))
+                .unwrap();
+            let words: Vec<u8> = command.iter().flat_map(|word| [word.as_bytes(), &[0]].concat()).collect();
+            fs::write(path.join("cmdline"), words).unwrap();
+            if let Some(environment) = environment {
+                fs::write(path.join("environ"), environment.replace(' ', "\0")).unwrap();
+            }
+        }
+    }
+
+    fn user(uid: u32) -> Environment {
+        Environment {
+            uid,
+            xdg_runtime_dir: Some(format!("/run/user/{uid}").into()),
+            ..Environment::default()
+        }
+    }
+
+    #[test]
+    fn finds_hubs_of_all_users() {
+        let machine = Machine::new();
+        machine.process(10, 0, &["sudo", "scanhub", "run"], None);
+        machine.process(11, 0, &["scanhub", "run", "--link", "front=/dev/ttyUSB0"], None);
+        machine.process(12, 998, &["/usr/local/bin/scanhub", "--json", "run"], None);
+        machine.process(13, 1000, &["./scanhub", "--domain", "lab", "replay", "a.mcap"], None);
+        machine.process(14, 1000, &["scanhub", "list"], None);
+        machine.process(15, 1000, &["scanhub", "echo", "run"], None);
+        machine.process(16, 0, &[], None);
+        machine.process(17, 1000, &["scanhub", "run", "--domain", "x; id"], None);
+        machine.process(18, 1000, &["scanhub", "run"], Some(""));
+        machine.process(19, 1000, &["scanhub", "run"], Some("SCANHUB_DOMAIN=lab"));
+        let hubs = RunningHub::all(machine.0.path());
+        let found: Vec<_> =
+            hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_deref())).collect();
+        assert_eq!(
+            found,
+            [
+                (11, "root", None),
+                (12, "scanhub", None),
+                (13, "alice", Some("lab")),
+                (18, "alice", Some("scanhub")),
+                (19, "alice", Some("lab")),
+            ]
+        );
+        assert_eq!(RunningHub::all(Path::new("/nowhere")), []);
+    }
+
+    #[test]
+    fn names_the_command_that_reaches_a_hub() {
+        let command = |uid, words: &[&str], environment: Option<&str>, caller: u32| {
+            let machine = Machine::new();
+            machine.process(7, uid, words, environment);
+            let [hub] = &RunningHub::all(machine.0.path())[..] else { panic!("one hub") };
+            hub.command("list", "scanhub", &user(caller))
+        };
+        let run = ["scanhub", "run"];
+        // Its domain may be in its environment, which other users cannot read.
+        assert_eq!(command(0, &run, None, 1000), "sudo scanhub list --domains");
+        let named = ["/usr/local/bin/scanhub", "run", "--domain", "scanhub"];
+        assert_eq!(command(998, &named, None, 1000), "sudo -u scanhub scanhub list");
+        assert_eq!(command(1000, &run, None, 1001), "sudo -u alice scanhub list --domains");
+        assert_eq!(command(65_531, &run, Some("A=b"), 0), "sudo -u '#65531' scanhub list");
+        // Root can read where the hub is: sudo does not pass the variable on, and a client looks there anyway.
+        let logged_in = Some("HOME=/home/alice XDG_RUNTIME_DIR=/run/user/1000");
+        assert_eq!(command(1000, &run, logged_in, 0), "sudo -u alice scanhub list");
+        let elsewhere = Some("XDG_RUNTIME_DIR=/run/user/1000 SCANHUB_DOMAIN=lab");
+        assert_eq!(
+            command(0, &run, elsewhere, 1000),
+            "sudo scanhub list --domain lab --root /run/user/1000/scanhub"
+        );
+        let flags = ["/opt/scanhub", "run", "--root=/srv/a b", "--domain=lab"];
+        assert_eq!(command(0, &flags, None, 1000), "sudo /opt/scanhub list --domain lab --root '/srv/a b'");
+        // Its working directory cannot be read.
+        assert_eq!(command(0, &["./scanhub", "run"], None, 1000), "sudo scanhub list --domains");
+        assert_eq!(
+            command(1000, &["scanhub", "run", "--domain", "lab"], logged_in, 1000),
+            "scanhub list --domain lab"
+        );
     }
 }

@@ -24,7 +24,7 @@ use rustix::time::{ClockId, Timespec};
 
 use scanhub_schema::{Failure, Kind, Ring};
 
-use crate::node::Node;
+use crate::processes::Node;
 use crate::segments::{Segment, in_the_way};
 use crate::shortage::{SHARED_MEMORY, memory};
 

@@ -1,5 +1,9 @@
-//! Files in shared memory under a domain's prefix, which all users of the machine could create:
+//! Files in shared memory, which lie in one directory for all users of the machine. Their names start with the prefix of
+//! their domain:
 //!
+//! - The prefix is `sh_DOMAIN_WORD_`. WORD is random: without it, another user could occupy the names before the hub starts.
+//!   The prefix is stored in the file `prefix` of the domain's directory, which only this user can read. It stays as long as
+//!   any process uses it.
 //! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because
 //!   the library only reports "internal error".
 //! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it
@@ -8,7 +12,8 @@
 //! - A publisher's segments are allocated, because the first access to a full /dev/shm would end the process.
 
 use std::fs::{self, File, Metadata, OpenOptions};
-use std::io::Write;
+use std::hash::{BuildHasher, RandomState};
+use std::io::{Read, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -18,9 +23,8 @@ use rustix::io::Errno;
 use scanhub_files::path_walk::named;
 use scanhub_schema::{Failure, Kind};
 
-use crate::directory::Directory;
+use crate::directory::{Directory, MakingLock};
 use crate::domain::Domain;
-use crate::prefix::{PREFIX_FILE, prefix_of, read_prefix};
 use crate::shortage::{self, SHARED_MEMORY, memory};
 
 /// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
@@ -88,10 +92,8 @@ impl Segment {
 /// Empty if the domain has no names.
 pub fn strangers(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix_of(root) else { return Vec::new() };
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
-    let mut found: Vec<_> =
-        named.filter_map(|entry| Segment::at(&entry.path())).filter(Segment::is_foreign).collect();
+    let segments = entries(&prefix).filter_map(|path| Segment::at(&path));
+    let mut found: Vec<_> = segments.filter(Segment::is_foreign).collect();
     found.sort_by(|a, b| a.path.cmp(&b.path));
     found
 }
@@ -111,6 +113,13 @@ pub(crate) fn in_the_way(segment: &Segment) -> Failure {
     )
 }
 
+/// Returns the files in shared memory whose names start with `prefix`.
+fn entries(prefix: &str) -> impl Iterator<Item = PathBuf> {
+    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    let named = entries.filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix));
+    named.map(|entry| entry.path())
+}
+
 /// Allocates the memory of all segments that `domain` has reserved so far.
 ///
 /// # Errors
@@ -118,28 +127,86 @@ pub(crate) fn in_the_way(segment: &Segment) -> Failure {
 /// Returns [`Kind::Short`] if there is not enough memory.
 pub fn allocate(domain: &Domain) -> Result<(), Failure> {
     let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
-    let user = rustix::process::geteuid().as_raw();
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+    for path in entries(&prefix) {
         // Skip segments of other users, and those that have been removed in between.
-        if !entry.metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == user) {
+        if !Segment::at(&path).is_some_and(|segment| segment.is_own()) {
             continue;
         }
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
-        let Ok(segment) = OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
-            continue;
-        };
-        let Ok(metadata) = segment.metadata() else { continue };
-        if metadata.len() == 0 {
-            continue;
-        }
-        // After any other error, the allocation may succeed later.
-        if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            return Err(memory(&format!("no room for {name}: {} kB", metadata.len() / 1024)));
+        let segment = OpenOptions::new().write(true).custom_flags(flags).open(&path);
+        let Ok((bytes, segment)) = segment.and_then(|it| Ok((it.metadata()?.len(), it))) else { continue };
+        // After any other error, the allocation may succeed later. An empty segment has nothing to allocate.
+        if fallocate(&segment, FallocateFlags::empty(), 0, bytes) == Err(Errno::NOSPC) {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            return Err(memory(&format!("no room for {name}: {} kB", bytes / 1024)));
         }
     }
     Ok(())
+}
+
+/// Returns the prefix of the domain in `root`. `None` if no process has published there, or all have ended.
+///
+/// # Errors
+///
+/// Returns the errors of [`Directory::open`] and [`Directory::file`].
+pub(crate) fn prefix_of(root: &Path) -> Result<Option<String>, Failure> {
+    match Directory::open(root)? {
+        Some(directory) => read_prefix(&directory, root),
+        None => Ok(None),
+    }
+}
+
+/// Returns the prefix of the domain in `root`, and chooses one if the domain has none.
+///
+/// # Errors
+///
+/// Returns the errors of [`prefix_of`], and an error if the file cannot be written.
+pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String, Failure> {
+    let directory = Directory::make(root)?;
+    if let Some(prefix) = read_prefix(&directory, root)? {
+        return Ok(prefix);
+    }
+    // The hash is keyed with random numbers of the system. Another user cannot create files with all names, but
+    // possibly with some.
+    let mut words = (0..).map(|number: u32| random_word(RandomState::new().hash_one(number)));
+    let prefixes = words.by_ref().map(|word| format!("{}{word}_", prefix_start(root)));
+    let prefix =
+        prefixes.take(MAX_ATTEMPTS).find(|prefix| entries(prefix).next().is_none()).ok_or_else(|| {
+            let what = format!("{SHARED_MEMORY} is full of files that start with {}", prefix_start(root));
+            Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
+        })?;
+    directory.replace(PREFIX_FILE, format!("{prefix}\n").as_bytes())?;
+    Ok(prefix)
+}
+
+fn random_word(mut random: u64) -> String {
+    let letters = std::iter::repeat_with(|| {
+        let letter = LETTERS[(random % LETTERS.len() as u64) as usize];
+        random /= LETTERS.len() as u64;
+        letter as char
+    });
+    letters.take(RANDOM_LETTERS).collect()
+}
+
+/// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written here, and counts as
+/// none.
+///
+/// # Errors
+///
+/// Returns the errors of [`Directory::file`].
+pub(crate) fn read_prefix(directory: &Directory, root: &Path) -> Result<Option<String>, Failure> {
+    let Some(file) = directory.file(PREFIX_FILE)? else { return Ok(None) };
+    let mut text = String::new();
+    let read = file.take(MAX_PREFIX_FILE_BYTES).read_to_string(&mut text);
+    let is_one = |prefix: &str| {
+        let random = prefix.strip_prefix(&prefix_start(root)).and_then(|rest| rest.strip_suffix('_'));
+        random.is_some_and(|it| it.len() == RANDOM_LETTERS && it.bytes().all(|byte| LETTERS.contains(&byte)))
+    };
+    Ok(read.ok().and_then(|_| text.strip_suffix('\n')).filter(|prefix| is_one(prefix)).map(str::to_owned))
+}
+
+fn prefix_start(root: &Path) -> String {
+    format!("sh_{}_", root.file_name().unwrap_or_default().to_string_lossy())
 }
 
 /// Creates the node counter under `prefix`, unless it exists and belongs to this user alone.
@@ -215,6 +282,15 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
     content
 };
 
+/// Name of the prefix's file in the domain's directory.
+const PREFIX_FILE: &str = "prefix";
+/// Length of the random word: 60 million words.
+const RANDOM_LETTERS: usize = 5;
+const LETTERS: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
+const MAX_PREFIX_FILE_BYTES: u64 = 64;
+/// Number of random words to try. If all are taken, this is not by chance.
+const MAX_ATTEMPTS: usize = 16;
+
 #[cfg(test)]
 mod tests {
     use iceoryx2::config::Config;
@@ -236,9 +312,8 @@ mod tests {
             builder.config(&config).create::<ipc::Service>().unwrap()
         };
         let files = || {
-            let entries = fs::read_dir(SHARED_MEMORY).unwrap().flatten();
-            let own = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
-            own.map(|entry| (entry.path(), fs::read(entry.path()).unwrap())).collect::<Vec<_>>()
+            let content = |path: PathBuf| (path.clone(), fs::read(path).unwrap());
+            entries(&prefix).map(content).collect::<Vec<_>>()
         };
         drop(join());
         let theirs = files();
@@ -269,5 +344,21 @@ mod tests {
         assert_eq!((removed, ours, &counted), (vec![], content(0), &content(1)));
         assert_eq!((kept, repaired), ((counted, Some(0o600)), content(0)));
         assert_eq!(closed, Some(0o600), "the library's own, which is open to all, does not stay");
+    }
+
+    #[test]
+    fn a_word_is_kept_and_never_the_same_twice() {
+        let base = tempfile::tempdir().unwrap();
+        let root = base.path().join("a-1");
+        assert_eq!(prefix_of(&root), Ok(None), "there is no such directory");
+        let ensure_prefix = |root: &Path| ensure_prefix(root, &MakingLock::wait(root).unwrap());
+        let first = ensure_prefix(&root).unwrap();
+        assert!(first.starts_with("sh_a-1_") && first.len() == 13, "{first}");
+        assert_eq!((ensure_prefix(&root), prefix_of(&root)), (Ok(first.clone()), Ok(Some(first.clone()))));
+        for written in ["", "sh_a-1_four_\n", "sh_b_12345_\n", "sh_a-1_12/45_\n"] {
+            fs::write(root.join(PREFIX_FILE), written).unwrap();
+            assert_eq!(prefix_of(&root), Ok(None), "{written:?}");
+        }
+        assert_ne!(ensure_prefix(&root).unwrap(), first);
     }
 }

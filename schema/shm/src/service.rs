@@ -1,4 +1,4 @@
-//! Creates and opens services. Failures are classified by the remedy: wait, retry later, or report it to the user.
+//! Creates, opens and lists services. Failures are classified by the remedy: wait, retry later, or report it to the user.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -6,19 +6,23 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::publisher::PublisherCreateError;
-use iceoryx2::service::builder::event::EventOpenOrCreateError as EventError;
+use iceoryx2::prelude::CallbackProgression;
+use iceoryx2::prelude::ipc::Service;
+use iceoryx2::service::Service as _;
+use iceoryx2::service::builder::event::EventOpenOrCreateError;
 use iceoryx2::service::builder::publish_subscribe::{
-    PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError as TopicError,
+    PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
 };
-use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateError as ControlError;
+use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateError;
 use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Kind, is_remote, of_service};
+use scanhub_schema::{Failure, Kind, Maker, Topic, is_remote, of_service};
 
-use crate::file_lock::MakingLock;
-use crate::node::Node;
+use crate::directory::MakingLock;
+use crate::domain::Domain;
+use crate::processes::{Node, config};
 use crate::segments::access_failure;
 use crate::shortage;
 
@@ -64,40 +68,31 @@ impl From<ServiceCreateError> for OpenFailure {
     }
 }
 
-impl From<TopicError> for OpenFailure {
-    fn from(error: TopicError) -> OpenFailure {
-        match error {
-            TopicError::PublishSubscribeOpenError(error) => error.into(),
-            TopicError::PublishSubscribeCreateError(error) => ServiceCreateError::from(error).into(),
-            TopicError::SystemInFlux => OpenFailure::Absent,
-        }
-    }
-}
-
 impl From<PublishSubscribeOpenError> for OpenFailure {
     fn from(error: PublishSubscribeOpenError) -> OpenFailure {
         ServiceOpenError::from(error).into()
     }
 }
 
-impl From<EventError> for OpenFailure {
-    fn from(error: EventError) -> OpenFailure {
-        match error {
-            EventError::EventOpenError(error) => ServiceOpenError::from(error).into(),
-            EventError::EventCreateError(error) => ServiceCreateError::from(error).into(),
-            EventError::SystemInFlux => OpenFailure::Absent,
-        }
-    }
+/// Converts the errors of `open_or_create`, which the library has for each kind of service.
+macro_rules! open_failure {
+    ($($error:ident: $open:ident, $create:ident;)*) => {
+        $(impl From<$error> for OpenFailure {
+            fn from(error: $error) -> OpenFailure {
+                match error {
+                    $error::$open(error) => ServiceOpenError::from(error).into(),
+                    $error::$create(error) => ServiceCreateError::from(error).into(),
+                    $error::SystemInFlux => OpenFailure::Absent,
+                }
+            }
+        })*
+    };
 }
 
-impl From<ControlError> for OpenFailure {
-    fn from(error: ControlError) -> OpenFailure {
-        match error {
-            ControlError::RequestResponseOpenError(error) => ServiceOpenError::from(error).into(),
-            ControlError::RequestResponseCreateError(error) => ServiceCreateError::from(error).into(),
-            ControlError::SystemInFlux => OpenFailure::Absent,
-        }
-    }
+open_failure! {
+    EventOpenOrCreateError: EventOpenError, EventCreateError;
+    PublishSubscribeOpenOrCreateError: PublishSubscribeOpenError, PublishSubscribeCreateError;
+    RequestResponseOpenOrCreateError: RequestResponseOpenError, RequestResponseCreateError;
 }
 
 /// Returns the name of a service as the library takes it.
@@ -142,6 +137,60 @@ where
         Err(OpenFailure::Absent) => Ok(None),
         Err(failed) => Err(failure(node, service, failed)),
     }
+}
+
+/// Returns the sensors that have topics in `domain`, sorted.
+///
+/// # Errors
+///
+/// Returns the errors of [`published`].
+pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
+    sensors_with(domain, |_| true)
+}
+
+/// Returns those of [`sensors`] that have a link, here or on another machine. A tracker has no link.
+///
+/// # Errors
+///
+/// Returns the errors of [`published`].
+pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
+    sensors_with(domain, |topic| topic.maker() == Maker::Link)
+}
+
+/// Returns those of [`sensors`] that have zones. A robot's combined verdict is computed from them.
+///
+/// # Errors
+///
+/// Returns the errors of [`published`].
+pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
+    sensors_with(domain, |topic| topic == Topic::Zones)
+}
+
+fn sensors_with(domain: &Domain, is_wanted: impl Fn(Topic) -> bool) -> Result<Vec<String>, Failure> {
+    let topics = published(domain)?.into_iter().filter(|(_, topic)| is_wanted(*topic));
+    let mut sensors: Vec<String> = topics.map(|(sensor, _)| sensor).collect();
+    sensors.dedup();
+    Ok(sensors)
+}
+
+/// Returns all topics in `domain` with their sensors, sorted by sensor. Those of a dead hub stay as long as a subscriber
+/// keeps them.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
+    let mut topics = Vec::new();
+    let Some(config) = config(domain.root())? else { return Ok(topics) };
+    let listed = Service::list(&config, |service| {
+        if let Some((sensor, Some(topic))) = of_service(service.static_details.name().as_str()) {
+            topics.push((sensor.to_owned(), topic));
+        }
+        CallbackProgression::Continue
+    });
+    listed.map_err(|error| access_failure(domain.root(), format!("cannot list topics: {error:?}")))?;
+    topics.sort_by(|(one, _), (other, _)| one.cmp(other));
+    Ok(topics)
 }
 
 /// Returns the failure for a publisher that cannot be created.

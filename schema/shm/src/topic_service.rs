@@ -19,7 +19,7 @@ use iceoryx2::service::port_factory::publish_subscribe;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Header, Kind, Topic, limits};
 
-use crate::node::Node;
+use crate::processes::Node;
 use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher, open};
 use crate::shortage::check_client;
 

@@ -19,7 +19,7 @@ use rustix::io::Errno;
 use scanhub_schema::{Failure, Kind, Ring, Topic, Wake, limits};
 
 use crate::doorbell::DoorbellRinger;
-use crate::node::Node;
+use crate::processes::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::check_client;
 

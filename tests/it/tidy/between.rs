@@ -52,11 +52,11 @@ fn modules_of_shm_form_layers() {
             tree.with(&format!("schema/shm/src/{module}.rs"), &format!("//! So.\n{code}\n"))
         };
         vec![
-            planted("file_lock", "use crate::prefix::prefix_of;"),
-            planted("node", "crate::lock::holder(root)?;"),
+            planted("directory", "use crate::segments::prefix_of;"),
+            planted("segments", "crate::processes::holder(root)?;"),
             planted("shortage", "use crate::Domain;"),
-            planted("shortage", "use crate::{domain::Domain, prefix};"),
-            planted("segments", "use super::node::Node;"),
+            planted("shortage", "use crate::{domain::Domain, segments};"),
+            planted("segments", "use super::processes::Node;"),
             planted("planted", "use crate::domain::Domain;"),
         ]
     });

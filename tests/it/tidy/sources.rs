@@ -23,7 +23,7 @@ const UNSAFE: [&str; 9] = [
     // The descriptors that wake consumers.
     "schema/shm/src/wake.rs",
     // The kernel's word whether nobody has a file.
-    "schema/shm/src/clean.rs",
+    "schema/shm/src/file_in_use.rs",
     // A handler for SIGBUS.
     "hub/daemon/src/process.rs",
     // What the kernel knows of a UART.

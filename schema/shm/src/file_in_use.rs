@@ -1,0 +1,66 @@
+//! Checks whether any process uses a file.
+#![allow(unsafe_code)]
+
+use std::fs::OpenOptions;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+use nix::libc::{self, c_int};
+use rustix::fs::OFlags;
+
+/// Returns whether no process has the file at `path` open or mapped. Only then does the kernel grant a lease for
+/// writing (fcntl(2)). Only the kernel knows this: processes that this one cannot see, or in a container that shares
+/// the memory, count too.
+///
+/// Returns false if the answer is unknown, for example for a file of another user. A process that opens the file during
+/// this call waits until the call returns.
+pub fn is_unheld(path: &Path) -> bool {
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
+    let Ok(file) = opened else { return false };
+    let control = |command: c_int, argument: c_int| {
+        // SAFETY: these commands take a number and touch no memory of this process, and the descriptor is open.
+        unsafe { libc::fcntl(file.as_raw_fd(), command, argument) == 0 }
+    };
+    // The default signal to the holder of a lease that another process waits for would end this process.
+    control(F_SETSIG, libc::SIGURG)
+        && control(libc::F_SETLEASE, libc::F_WRLCK)
+        && control(libc::F_SETLEASE, libc::F_UNLCK)
+}
+
+/// asm-generic/fcntl.h.
+const F_SETSIG: c_int = 10;
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, File};
+
+    use memmap2::MmapOptions;
+
+    use super::*;
+
+    #[test]
+    fn whoever_has_it_open_or_mapped_holds_it() {
+        let path = Path::new(crate::shortage::SHARED_MEMORY).join(format!("shu{}", std::process::id()));
+        assert!(!is_unheld(&path), "it is not there");
+        let made = File::create_new(&path).unwrap();
+        made.set_len(4096).unwrap();
+        let is_unheld = || is_unheld(&path);
+        let written = is_unheld();
+        drop(made);
+        let free = is_unheld();
+        let opened = File::open(&path).unwrap();
+        let read = is_unheld();
+        let mapped = MmapOptions::new().len(4096).map_raw_read_only(&opened).unwrap();
+        drop(opened);
+        let only_mapped = is_unheld();
+        drop(mapped);
+        let free_again = is_unheld();
+        fs::remove_file(&path).unwrap();
+        assert_eq!([written, read, only_mapped], [false; 3]);
+        // A system without leases does not know.
+        assert_eq!(free, free_again);
+        assert!(free || fs::read_to_string("/proc/sys/fs/leases-enable").is_ok_and(|it| it.trim() == "0"));
+    }
+}

@@ -1,0 +1,458 @@
+//! Processes of a domain: their membership, the locks of those that publish, and the cleanup after those that have died.
+//!
+//! - Each process joins with a [`Node`]. The last one to leave removes the domain's names.
+//! - At most one hub, at most one listener for remote sensors, and one process for each name of a sensor, tracker or mount
+//!   hold a lock. A lock ends with its process. Subscribers query the locks but never take one.
+//! - A cleanup does not touch files in shared memory that did not belong to a known dead process.
+
+use std::fs::{self, File};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use iceoryx2::config::Config;
+use iceoryx2::node::NodeState;
+use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::{
+    CallbackProgression, FileName, LogLevel, NodeBuilder, SemanticString, SignalHandlingMode,
+    set_log_level_from_env_or,
+};
+use rustix::fs::FileType;
+use scanhub_schema::{Failure, Kind};
+
+use crate::directory::{Directory, FileLock, MakingLock, content, held_file, pid_in};
+use crate::domain::{Domain, Environment};
+use crate::segments::{access_failure, ensure_node_counter, ensure_prefix, forget, prefix_of, read_prefix};
+
+/// Version of the shared-memory library. Processes with another version are refused.
+pub const LIBRARY: &str = "iceoryx2 0.10.0";
+
+/// Membership of a process in a domain.
+pub type Node = iceoryx2::node::Node<Service>;
+
+/// Returns the node of a publisher in `domain`, which holds its [`HubLock`](crate::HubLock),
+/// [`ListenLock`](crate::ListenLock) or a [`NameLock`](crate::NameLock). Removes the files that dead publishers and
+/// subscribers left.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
+    node(domain, true)
+}
+
+/// Returns the node of a subscriber in `domain`. It removes no files.
+///
+/// # Errors
+///
+/// Returns the errors of [`hub_node`], and [`Kind::NoHub`] if the domain has no prefix.
+pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
+    node(domain, false)
+}
+
+fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
+    set_log_level_from_env_or(LogLevel::Error);
+    let root = domain.root();
+    let _making = if cleanup {
+        let making = MakingLock::wait(root)?;
+        ensure_prefix(root, &making)?;
+        remove_unfinished_services(root);
+        Some(making)
+    } else {
+        None
+    };
+    let no_names = || {
+        let hint = "its hub is just starting or ending, or has another version";
+        Failure::new(
+            Kind::NoHub,
+            format!("{} does not contain the name of the shared memory", root.display()),
+            hint,
+        )
+    };
+    let mut config = config(root)?.ok_or_else(no_names)?;
+    ensure_node_counter(&config.global.prefix.to_string())?;
+    config.global.node.cleanup_dead_nodes_on_creation = cleanup;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    if !cleanup {
+        config.global.creation_timeout = Duration::from_millis(100);
+    }
+    NodeBuilder::new()
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .config(&config)
+        .create::<Service>()
+        .map_err(|error| access_failure(root, format!("cannot join {}: {error:?}", domain.name())))
+}
+
+/// Returns whether `node` uses the current prefix of the domain in `root`. The prefix changes after all processes have
+/// left.
+///
+/// # Errors
+///
+/// Returns the errors of [`client_node`].
+pub fn is_member(node: &Node, root: &Path) -> Result<bool, Failure> {
+    let prefix = prefix_of(root)?;
+    Ok(prefix.is_some_and(|prefix| node.config().global.prefix.as_bytes() == prefix.as_bytes()))
+}
+
+/// Processes that have joined a domain.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Nodes {
+    /// Running processes.
+    pub alive: usize,
+    /// Processes that ended without cleaning up. Their files still exist.
+    pub dead: usize,
+}
+
+/// Returns the number of processes in `domain`; 0 if the domain does not exist.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
+    nodes_at(domain.root())
+}
+
+/// Returns the number of processes in the domain in `root`.
+fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
+    let mut nodes = Nodes::default();
+    let Some(config) = config(root)? else { return Ok(nodes) };
+    let listed = Node::list(&config, |state| {
+        match state {
+            NodeState::Alive(_) => nodes.alive += 1,
+            NodeState::Dead(_) => nodes.dead += 1,
+            NodeState::Inaccessible(_) | NodeState::Undefined(_) => {}
+        }
+        CallbackProgression::Continue
+    });
+    listed.map_err(|error| access_failure(root, format!("cannot list processes: {error:?}")))?;
+    Ok(nodes)
+}
+
+/// Lock of a hub on its domain. It ends with the value or with the process, however that ends. Drop it after the hub's
+/// node.
+#[derive(Debug)]
+pub struct HubLock(Publishing);
+
+impl HubLock {
+    /// Creates the directory `root` for this user only, takes the lock, and writes this process's ID into it.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns
+    /// [`Kind::Failed`] if the directory belongs to another user or cannot be created.
+    pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
+        Publishing::acquire(root, HUB, "hub").map(HubLock)
+    }
+
+    /// Reports to clients that all topics exist. Until then, [`is_starting`] is true.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if the lock's file cannot be written.
+    pub fn report_ready(&self) -> Result<(), Failure> {
+        let Publishing { root, lock, .. } = &self.0;
+        lock.write(root, &format!("{}\n{READY}\n", std::process::id()))
+    }
+}
+
+/// Lock of the listener that publishes remote sensors. It ends like a hub's lock, and both can exist in one domain.
+#[derive(Debug)]
+pub struct ListenLock {
+    _publishing: Publishing,
+}
+
+impl ListenLock {
+    /// Takes the lock as [`HubLock::acquire`] does.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`HubLock::acquire`], with another listener instead of another hub.
+    pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
+        Ok(ListenLock { _publishing: Publishing::acquire(root, LISTENER, "listener")? })
+    }
+}
+
+/// Lock of the process that publishes under a name: a program with a tracker or a mount, or the hub with a link.
+/// Doorbell and services of the name belong to this process alone. A hub is not necessary.
+#[derive(Debug)]
+pub struct NameLock {
+    root: PathBuf,
+    _lock: FileLock,
+}
+
+impl NameLock {
+    /// Takes the lock of `name` as [`HubLock::acquire`] does.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the
+    /// errors of [`HubLock::acquire`].
+    pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
+        let lock = acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid));
+        Ok(NameLock { _lock: lock?, root: root.to_owned() })
+    }
+}
+
+/// Returns the failure if process `pid` publishes under `name`.
+pub fn name_held(name: &str, pid: u32) -> Failure {
+    let process = match fs::read_to_string(format!("/proc/{pid}/comm")) {
+        _ if pid == 0 => "another process".to_owned(),
+        Ok(program) => format!("process {pid} ({})", program.trim_end()),
+        Err(_) => format!("process {pid}"),
+    };
+    let what = format!("the name {name} is published by {process}");
+    Failure::new(Kind::NameHeld, what, "end it, or choose another name")
+}
+
+impl Drop for NameLock {
+    /// The last publisher removes the names of the shared memory, as `Publishing` does.
+    fn drop(&mut self) {
+        if let Ok(None) = publisher(&self.root) {
+            forget_names(&self.root);
+        }
+    }
+}
+
+/// Lock of a hub or a listener, with the cleanup at its end.
+#[derive(Debug)]
+struct Publishing {
+    root: PathBuf,
+    name: &'static str,
+    lock: FileLock,
+}
+
+impl Publishing {
+    fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
+        let lock = acquire(root, name, |pid| held(root, who, pid))?;
+        Ok(Publishing { lock, root: root.to_owned(), name })
+    }
+}
+
+impl Drop for Publishing {
+    /// The last publisher removes the names while it still has the lock. The next hub chooses other names.
+    fn drop(&mut self) {
+        let other = if self.name == HUB { LISTENER } else { HUB };
+        // The holder of the other lock uses the names, or is about to join under them.
+        if let Ok(None) = holder_of(&self.root, other) {
+            forget_names(&self.root);
+        }
+    }
+}
+
+/// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's file.
+/// `held` returns the failure if another process has the lock.
+fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<FileLock, Failure> {
+    let lock = FileLock::acquire(root, name, held)?;
+    // A reader that finds a process ID relies on the prefix.
+    ensure_prefix(root, &MakingLock::wait(root)?)?;
+    lock.write(root, &format!("{}\n", std::process::id()))?;
+    Ok(lock)
+}
+
+/// Returns the process of the hub in the domain in `root`; 0 if the hub has not written its ID yet. `None` if no hub
+/// runs there.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] if the directory belongs to another user.
+pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
+    holder_of(root, HUB)
+}
+
+/// Returns whether a hub in `root` does not have all its topics yet, and started at most a minute ago.
+///
+/// # Errors
+///
+/// Returns the errors of [`holder`].
+pub fn is_starting(root: &Path) -> Result<bool, Failure> {
+    let held = held_file(root, HUB)?;
+    Ok(held.is_some_and(|(_, file)| content(&file).lines().nth(1) != Some(READY) && is_recent(&file)))
+}
+
+/// Returns the process that publishes in `root`: the hub, or otherwise a listener. 0 as for [`holder`].
+///
+/// # Errors
+///
+/// Returns the errors of [`holder`].
+pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
+    match holder_of(root, HUB)? {
+        None => holder_of(root, LISTENER),
+        hub => Ok(hub),
+    }
+}
+
+/// Returns the domain in which a program publishes: at the first place, in the order in which clients search, where a
+/// hub or a listener is running. If none is, at the place that a hub in this `environment` would take, so that the hub
+/// that starts next is in the same domain. Only below `base` if it is given.
+///
+/// # Errors
+///
+/// Returns the errors of [`Domain::at`].
+pub fn publisher_domain(
+    name: &str,
+    base: Option<&Path>,
+    environment: &Environment,
+) -> Result<Domain, Failure> {
+    let is_live = |domain: &Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    match Domain::candidates(name, base, environment)?.into_iter().find(is_live) {
+        Some(live) => Ok(live),
+        None => Domain::of_hub(name, base, environment),
+    }
+}
+
+fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
+    let Some((directory, file)) = held_file(root, name)? else { return Ok(None) };
+    // A process that just starts or ends has the lock, and the file may have the ID of an earlier process.
+    Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
+}
+
+/// Result of a cleanup.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cleaned {
+    /// Processes that had ended without cleaning up.
+    pub dead: usize,
+    /// Processes that still run. Nothing that belongs to them was removed.
+    pub alive: usize,
+    /// Whether the domain's directory was removed.
+    pub root: bool,
+}
+
+/// Removes files that dead processes left in `domain`. Everything that a running process uses stays, and so does the
+/// directory while any process runs.
+///
+/// # Errors
+///
+/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by itself.
+/// Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
+pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
+    let root = domain.root();
+    let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };
+    // No process can start to publish while these locks are held.
+    let _hub = HubLock::acquire(root)?;
+    let _listener = ListenLock::acquire(root)?;
+    let before = nodes(domain)?;
+    let node = hub_node(domain)?;
+    node.blocking_cleanup_dead_nodes(CLEANUP_TIMEOUT);
+    drop(node);
+    let after = nodes(domain)?;
+    let root = after.alive == 0 && after.dead == 0 && remove_domain(&directory, root);
+    Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
+}
+
+/// Removes the domain's `directory` at `root` with everything that only running processes need: empty directories,
+/// locks, names, and the saved state of sensors. Returns whether the directory was removed. It stays if it contains
+/// anything else.
+fn remove_domain(directory: &Directory, root: &Path) -> bool {
+    forget(directory, root);
+    for (name, stat) in directory.entries() {
+        let extension = Path::new(&name).extension();
+        match FileType::from_raw_mode(stat.st_mode) {
+            FileType::Directory => directory.remove_empty(&name),
+            FileType::RegularFile if extension.is_some_and(|kind| kind == "lock" || kind == "sensor") => {
+                directory.remove(&name);
+            }
+            _ => {}
+        }
+    }
+    directory.remove_itself()
+}
+
+/// Removes the names of the domain in `root` if no process is left. The next hub chooses names that no other user can
+/// have seen.
+pub(crate) fn forget_names(root: &Path) {
+    let Ok(Some(directory)) = Directory::open(root) else { return };
+    // Not while another process joins to publish.
+    let Ok(_making) = MakingLock::wait(root) else { return };
+    if nodes_at(root).is_ok_and(|nodes| nodes == Nodes::default()) {
+        forget(&directory, root);
+    }
+}
+
+/// Returns the configuration of the shared-memory library; `None` for a domain without a prefix. It never comes from a
+/// file, which the library would search in the working directory.
+pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
+    let Some(prefix) = prefix_of(root)? else { return Ok(None) };
+    let unusable = || Failure::new(Kind::Configuration, format!("{} cannot be a root", root.display()), "");
+    let path = iceoryx2::prelude::Path::new(root.as_os_str().as_bytes()).map_err(|_| unusable())?;
+    let mut config = Config::default();
+    config.global.prefix = FileName::new(prefix.as_bytes()).map_err(|_| unusable())?;
+    config.global.set_root_path(&path);
+    Ok(Some(config))
+}
+
+/// Removes unfinished service descriptions of the domain in `root`, which a hub leaves if it is killed while it creates
+/// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
+/// service again.
+///
+/// The caller must hold the [`MakingLock`]. Then no process creates services, and no process has opened an unfinished
+/// one. Finished descriptions are read-only.
+fn remove_unfinished_services(root: &Path) {
+    let Ok(Some(directory)) = Directory::open(root) else { return };
+    let Some(services) = directory.below(SERVICES) else { return };
+    for (name, stat) in services.entries() {
+        let finished = stat.st_mode & 0o200 == 0;
+        if !finished && name.to_string_lossy().ends_with(SUFFIX) {
+            services.remove(&name);
+        }
+    }
+}
+
+/// Returns whether the file was written in the last minute. A clock that was set back does not count.
+fn is_recent(file: &File) -> bool {
+    let written = file.metadata().and_then(|metadata| metadata.modified());
+    written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START))
+}
+
+fn held(root: &Path, who: &str, pid: u32) -> Failure {
+    Failure::new(
+        Kind::DomainHeld,
+        format!("another {who} holds {}: pid {pid}", root.display()),
+        "stop it, or choose another --domain",
+    )
+}
+
+const HUB: &str = "hub.lock";
+const LISTENER: &str = "listen.lock";
+/// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is
+/// up.
+const MAX_START: Duration = Duration::from_secs(60);
+/// Second line of the file of a hub's lock once all topics exist.
+const READY: &str = "ready";
+
+/// The library's directory of service descriptions, below the root.
+const SERVICES: &str = "services";
+
+const SUFFIX: &str = ".service";
+/// Maximum wait for another process that is cleaning up after the same dead process.
+const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[test]
+    fn what_is_not_a_domains_stays() {
+        let base = tempfile::tempdir().unwrap();
+        let root = base.path().join("a");
+        let directory = Directory::make(&root).unwrap();
+        fs::create_dir(root.join("nodes")).unwrap();
+        symlink(root.join("full"), root.join("link.lock")).unwrap();
+        fs::create_dir(root.join("full")).unwrap();
+        for file in ["hub.lock", "front.sensor", "prefix", "full/something.lock", "letter"] {
+            fs::write(root.join(file), "").unwrap();
+        }
+        assert!(!remove_domain(&directory, &root));
+        let mut left: Vec<_> = fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, ["full", "letter", "link.lock"]);
+        assert!(root.join("full/something.lock").exists());
+        for file in ["link.lock", "letter", "full/something.lock"] {
+            fs::remove_file(root.join(file)).unwrap();
+        }
+        assert!(remove_domain(&directory, &root) && !root.exists());
+        assert!(remove_domain(&directory, &root), "it is gone already");
+    }
+}
