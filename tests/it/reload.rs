@@ -11,6 +11,9 @@ use crate::testkit::{
 use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=71", "--baud=500000"];
+/// Minimum time from the stamp of the last scan to that of unknown zones that the hub sends in a silence, in ns: a verdict
+/// is valid for two periods of 26.6 ms and 20 ms.
+const SILENCE_NS: u64 = 70_000_000;
 
 /// The configuration of one link in a file, with `more` behind it.
 fn configure(env: &TestEnv, more: &str) -> String {
@@ -66,9 +69,19 @@ fn circles_change_in_a_stream_without_a_gap() {
         sequence(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{class}");
     }
-    // The first verdict of other circles is one. A line that came too late here does not tell its circles.
+    // A line that came too late here does not tell its circles.
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64() && line["stale"] != true);
+    // On a busy machine, scans may be missing for so long that the hub sends unknown zones, at once with the new circles.
+    // They say nothing about the change. All other samples belong to a scan.
+    let mut last_ns = 0;
+    verdicts.retain(|line| {
+        let stamp_ns = number(line, "stamp_ns");
+        let is_silence = line["verdict"] == "unknown" && stamp_ns > last_ns + SILENCE_NS;
+        last_ns = if is_silence { last_ns } else { stamp_ns };
+        !is_silence
+    });
+    // The first verdict of other circles is not unknown.
     let firsts: Vec<_> = verdicts.windows(2).filter(|pair| radii(&pair[0]) != radii(&pair[1])).collect();
     assert_eq!(firsts.len(), 4, "{firsts:?}");
     assert!(firsts.iter().all(|pair| pair[1]["verdict"] != "unknown"), "{firsts:?}");
