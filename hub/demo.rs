@@ -16,7 +16,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::Domain;
-use scanhub_verbs::{Bounds, WatchOptions};
+use scanhub_verbs::Bounds;
+use scanhub_viewer::WatchOptions;
 use serde::Serialize;
 use serde_json::Value;
 
@@ -109,7 +110,7 @@ fn play_with_picture(
             play(options, stage, &mut |_, _| {}, &is_asked)
         });
         let closing = Raise(&closed);
-        let shown = scanhub_verbs::watch(&picture, out, &over);
+        let shown = scanhub_viewer::watch(&picture, out, &over);
         drop(closing);
         let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         shown.and(played)

@@ -146,11 +146,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Watch(watch) => {
             // The terminal is given back, whoever ends it.
             let stop = interrupt_by(&ENDS)?;
-            scanhub_verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
+            scanhub_viewer::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
         Verb::Web(web) => match &web.replay {
             Some(file) => replay::page::show(web, file, everywhere, &mut out, &interrupt()?),
-            None => scanhub_verbs::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
+            None => scanhub_viewer::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
         },
         Verb::Record(record) => {
             let options = record.options(everywhere)?;

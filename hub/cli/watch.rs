@@ -4,7 +4,7 @@ use std::io::{IsTerminal, stdout};
 
 use clap::Args;
 use scanhub_schema::{Failure, Kind};
-use scanhub_verbs::WatchOptions;
+use scanhub_viewer::WatchOptions;
 
 use super::{Everywhere, Limits};
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use scanhub_files::regular;
 use scanhub_schema::{Failure, Kind};
-use scanhub_verbs::WebOptions;
+use scanhub_viewer::WebOptions;
 
 use super::{Everywhere, Limits};
 
@@ -45,7 +45,7 @@ pub(crate) struct Web {
 }
 
 /// Port that `web` listens on if `--listen` names only an address.
-const DEFAULT_PORT: u16 = scanhub_verbs::WEB_PORT;
+const DEFAULT_PORT: u16 = scanhub_viewer::WEB_PORT;
 
 /// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as does
 /// `localhost`.

@@ -10,8 +10,8 @@ use std::thread;
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, PlaybackRate, Player};
 use scanhub_schema::{Failure, Kind};
-use scanhub_verbs::WebOptions;
-use scanhub_web::{Order, Playback, Progress};
+use scanhub_viewer::WebOptions;
+use scanhub_viewer::server::{Order, Playback, Progress};
 
 use crate::cli::{Everywhere, Web};
 use crate::own_domain::OwnDomain;
@@ -49,7 +49,7 @@ pub(crate) fn show(
         let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let mut shown = Ok(());
         if let Ok(keys) = is_ready.recv() {
-            shown = scanhub_verbs::web(&options, Some(&keys), out, stop);
+            shown = scanhub_viewer::web(&options, Some(&keys), out, stop);
             keys.0.end();
         }
         match hub.join() {

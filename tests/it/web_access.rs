@@ -1,5 +1,5 @@
 //! The page for whoever has no mouse, does not see it, or does not bear movement. Contrasts are computed where the colours
-//! are (`clients/web/src/page.rs`).
+//! are (`clients/viewer/src/server/page.rs`).
 
 use serde_json::{Value, json};
 

@@ -1,6 +1,6 @@
 //! The server of `web` among many, slow and hostile ones: who behaves well is served, memory and processor time stay small,
 //! and where the system is short of something it waits and says so. That nobody misses a message because of others is held
-//! where messages can be counted: `clients/web/tests/crowd.rs`.
+//! where messages can be counted: `clients/viewer/tests/crowd.rs`.
 
 use std::fs;
 use std::io::{Read, Write};

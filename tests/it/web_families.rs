@@ -7,8 +7,8 @@ use crate::browser::{Browser, Look};
 use crate::testkit::{INT, Sender, TestEnv, in_a_network, number, until};
 use crate::web::web;
 use crate::web_page::browse;
-use scanhub_scene::{Place, Scene};
 use scanhub_schema::{Contents, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
+use scanhub_viewer::scene::{Place, Scene};
 
 /// A hall that is as no mirror shows it.
 const HALL: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n

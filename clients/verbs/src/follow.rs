@@ -18,11 +18,11 @@ use scanhub_shm::Domain;
 use crate::discovery::Discovery;
 use crate::names::TopicName;
 use crate::output::End;
-use crate::receive_stats::ReceiveStats;
 use lines::{LineTrack, watch_parts};
 use shortage::Shortage;
 use track::Track;
 
+pub use crate::receive_stats::ReceiveStats;
 pub use notice::Notice;
 
 /// When a verb that follows ends by itself.
@@ -38,13 +38,13 @@ pub struct Bounds {
 
 impl Bounds {
     /// The run ends by itself: no hub at its start is a failure, an interrupt too.
-    pub(crate) fn bounded(&self) -> bool {
+    pub fn bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
 }
 
 /// What a verb does with what it follows.
-pub(crate) trait Sink {
+pub trait Sink {
     /// A topic will be followed.
     fn begin(&mut self, _name: &TopicName) {}
     /// The topic is there, and what is sent from now on will be received.
@@ -86,7 +86,7 @@ pub(crate) trait Sink {
 
 /// Follows `names`, and `topics` of each sensor that a hub has when it comes, in the first live one of `places` until
 /// `bounds` or `stop` end it.
-pub(crate) fn follow(
+pub fn follow(
     names: &[TopicName],
     topics: &[Topic],
     places: &[Domain],

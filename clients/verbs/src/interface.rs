@@ -63,23 +63,6 @@ pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
     ))
 }
 
-/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them. Link-local
-/// IPv6 addresses are left out, because a browser needs the interface too.
-#[cfg(feature = "web")]
-pub(crate) fn reachable_addresses() -> Vec<IpAddr> {
-    let entries = getifaddrs().into_iter().flatten();
-    let up = entries.filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP));
-    let addresses = up.filter_map(|entry| {
-        let ipv6 = || Some(IpAddr::from(entry.address.as_ref()?.as_sockaddr_in6()?.ip()));
-        ipv4(&entry).map(IpAddr::from).or_else(ipv6)
-    });
-    let is_local = |address: &IpAddr| match address {
-        IpAddr::V4(address) => address.is_loopback(),
-        IpAddr::V6(address) => address.is_loopback() || address.is_unicast_link_local(),
-    };
-    addresses.filter(|address| !is_local(address)).collect()
-}
-
 /// Whether a sender with `address` is on this machine; not if the system does not tell its addresses.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
     let is_it = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);

@@ -9,7 +9,7 @@ mod control;
 mod discovery;
 pub mod duration;
 mod echo;
-mod follow;
+pub mod follow;
 mod forward;
 mod gateway;
 mod hz;
@@ -24,10 +24,8 @@ mod list;
 mod listen;
 mod lossy_writer;
 mod mask;
-mod names;
-mod output;
-#[cfg(any(feature = "tui", feature = "web"))]
-mod picture;
+pub mod names;
+pub mod output;
 mod receive_stats;
 mod reception;
 #[cfg(feature = "record")]
@@ -38,13 +36,7 @@ mod stamp;
 mod text;
 mod tilt;
 mod track;
-#[cfg(feature = "tui")]
-mod watch;
-#[cfg(feature = "web")]
-mod web;
 mod window;
-#[cfg(any(feature = "tui", feature = "web"))]
-mod work;
 
 /// What carries samples to other machines and back has in common, whatever the network: the programs `scanhub` and
 /// `scanhub-bridge` are built of it.
@@ -75,7 +67,3 @@ pub use mask::{MaskOptions, mask};
 pub use record::{RecordLook, RecordOptions, Split, record};
 pub use tilt::{TiltOptions, tilt};
 pub use track::{TrackOptions, track};
-#[cfg(feature = "tui")]
-pub use watch::{WatchOptions, watch};
-#[cfg(feature = "web")]
-pub use web::{WEB_PORT, WebOptions, web};

@@ -6,11 +6,11 @@ use scanhub_schema::{Failure, Kind, ROBOT, Topic, check_followed};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct TopicName {
+pub struct TopicName {
     /// The sensor's name.
-    pub(crate) sensor: String,
+    pub sensor: String,
     /// The topic.
-    pub(crate) topic: Topic,
+    pub topic: Topic,
 }
 
 impl TopicName {
@@ -56,7 +56,7 @@ pub(crate) fn position(name: &str) -> u8 {
 }
 
 /// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
-pub(crate) fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
+pub fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
 }
 

@@ -8,7 +8,7 @@ use crate::line::Loss;
 
 /// The account of one topic in one run.
 #[derive(Clone, Debug)]
-pub(crate) struct ReceiveStats {
+pub struct ReceiveStats {
     topic: Topic,
     /// Samples received.
     pub(crate) received: u64,

@@ -181,11 +181,16 @@ fn ros_knows_only_schema() {
 #[test]
 fn the_scene_only_computes() {
     holds(crates::the_scene_only_computes, |tree| {
-        let (manifest, lib) = ("clients/scene/Cargo.toml", "clients/scene/src/lib.rs");
+        let planted =
+            |code: &str| tree.with("clients/viewer/src/scene/planted.rs", &format!("//! So.\n{code}\n"));
         vec![
-            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
-            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
-            tree.with("clients/scene/src/planted.rs", "//! So.\nuse std::time::Instant;\n"),
+            planted("use std::time::Instant;"),
+            planted("use std::time::{Duration, SystemTime};"),
+            planted("let text = std::fs::read_to_string(path)?;"),
+            planted("std::thread::spawn(run);"),
+            planted("let now_ns = scanhub_client::clock::now_ns();"),
+            planted("use crate::web::{WebOptions, web};"),
+            tree.with("clients/viewer/src/scene.rs", "//! So.\nuse super::work::Work;\n"),
         ]
     });
 }
@@ -205,11 +210,23 @@ fn three_dimensions_only_compute() {
 #[test]
 fn the_server_knows_no_hub() {
     holds(crates::the_server_knows_no_hub, |tree| {
-        let (manifest, lib) = ("clients/web/Cargo.toml", "clients/web/src/lib.rs");
+        let lib = "clients/viewer/src/lib.rs";
+        let planted =
+            |code: &str| tree.with("clients/viewer/src/server/planted.rs", &format!("//! So.\n{code}\n"));
         vec![
-            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
+            planted("use scanhub_client::subscribe;"),
+            planted("use scanhub_verbs as verbs;"),
+            planted("use scanhub_shm::Domain;"),
+            planted("use std::fs::File;"),
+            planted("use std::{fs, io};"),
+            planted("std::process::Command::new(\"sh\");"),
+            planted("use rustix::fs::open;"),
+            planted("use crate::web::web;"),
+            planted("use crate::{picture, scene};"),
+            planted("use crate as viewer;"),
+            planted("use super::super::picture::followed;"),
+            tree.with("clients/viewer/src/server.rs", "//! So.\nuse super::picture::followed;\n"),
             tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
-            tree.with("clients/web/src/planted.rs", "//! So.\nuse std::fs::File;\n"),
         ]
     });
 }
@@ -333,13 +350,13 @@ fn the_client_is_built_from_few_crates() {
 /// What needs a C compiler comes with recordings alone.
 #[test]
 fn clients_that_do_not_record_need_no_c_compiler() {
-    let in_c = |features: &[&str]| {
-        let crates = crates::built_from("scanhub-verbs", features);
+    let in_c = |package: &str, features: &[&str]| {
+        let crates = crates::built_from(package, features);
         // The exception is the kernel's interface in Rust.
         let is_in_c = |name: &String| name.contains("-sys ") && !name.starts_with("linux-raw-sys");
         crates.into_iter().filter(is_in_c).collect::<Vec<_>>()
     };
-    assert_eq!(in_c(&["--no-default-features", "--features", "tui"]), Vec::<String>::new());
-    let recording = in_c(&["--no-default-features", "--features", "record"]);
+    assert_eq!(in_c("scanhub-viewer", &[]), Vec::<String>::new());
+    let recording = in_c("scanhub-verbs", &["--no-default-features", "--features", "record"]);
     assert!(recording.iter().any(|name| name.starts_with("zstd-sys")), "{recording:?}");
 }

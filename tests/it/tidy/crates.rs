@@ -224,10 +224,10 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 }
 
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record, the ends of a network where they send and listen, the scene where they show it, what computes people and
-/// points for the verbs that publish them.
+/// words of ROS come with them where they record, the ends of a network where they send and listen, and what computes people
+/// and points for the verbs that publish them. The viewer stands on the verbs.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
-    let known: [(&str, &[&str]); 2] = [
+    let known: [(&str, &[&str]); 3] = [
         ("scanhub-client", &["scanhub-schema", "scanhub-shm"]),
         (
             "scanhub-verbs",
@@ -238,11 +238,13 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
                 "scanhub-schema",
                 "scanhub-shm",
                 "scanhub-ros",
-                "scanhub-scene",
                 "scanhub-tilt",
                 "scanhub-track",
-                "scanhub-web",
             ],
+        ),
+        (
+            "scanhub-viewer",
+            &["scanhub-client", "scanhub-ros", "scanhub-schema", "scanhub-shm", "scanhub-verbs"],
         ),
     ];
     knows_others(tree, &known)
@@ -313,12 +315,14 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// What a picture shows is told by samples and times, so that a terminal and a browser show the same.
+/// Finds in the scene what is more than computation: samples and times are its arguments, so that a terminal and a browser show
+/// the same.
 pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
-    const OUTSIDE: [&str; 6] = ["Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
-    let mut breaches = built_of(tree, "scanhub-scene", &["scanhub-schema"]);
-    breaches.extend(lacks(tree, "clients/scene/src/lib.rs", &["#![forbid(unsafe_code)]"]));
-    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/scene/src/")));
+    const HARMLESS: [&str; 4] = ["std::collections", "std::iter", "std::mem", "std::time::Duration"];
+    let is_harmless = |place: &String| HARMLESS.iter().any(|name| place.contains(name));
+    let mut breaches = names_others(tree, &VIEWER, "scene", &["scanhub-schema"], &[]);
+    breaches
+        .extend(outside(tree, "clients/viewer/src/scene").into_iter().filter(|place| !is_harmless(place)));
     breaches
 }
 
@@ -331,16 +335,63 @@ pub(crate) fn three_dimensions_only_compute(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// The server shows a scene to whoever comes, and cannot follow a hub: what strangers send ends in it.
+/// Finds in the web server what could reach a hub, a file or a process: input of strangers ends in it. It has an allowlist of
+/// crates and of modules, so that it cannot follow a hub through another module of its crate either.
 pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
-    let known = ["scanhub-ros", "scanhub-scene", "scanhub-schema"];
-    let members = tree.members();
-    let others =
-        ours(&members["scanhub-web"], &ALL).into_iter().filter(|name| !known.contains(&name.as_str()));
-    let mut breaches: Vec<_> = others.map(|name| format!("scanhub-web knows {name}")).collect();
-    breaches.extend(lacks(tree, "clients/web/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    const CRATES: [&str; 9] = [
+        "data-encoding",
+        "httparse",
+        "rustix",
+        "scanhub-ros",
+        "scanhub-schema",
+        "serde",
+        "serde_json",
+        "sha2",
+        "tungstenite",
+    ];
+    const OUTSIDE: [&str; 6] =
+        ["std::fs", "std::process", "std::env", "std::{", "rustix::fs", "rustix::process"];
+    let mut breaches = names_others(tree, &VIEWER, "server", &CRATES, &["scene"]);
+    breaches.extend(lacks(tree, "clients/viewer/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/viewer/src/server")));
     breaches
-        .extend(find(tree, &["std::fs", "process::Command"], |path| path.starts_with("clients/web/src/")));
+}
+
+/// A crate by its name and the folder of its sources.
+struct Sources {
+    name: &'static str,
+    folder: &'static str,
+}
+
+const VIEWER: Sources = Sources { name: "scanhub-viewer", folder: "clients/viewer/src" };
+
+/// Finds what `module`, a file with a folder of the same name, names of its crate besides itself and `modules`, and which
+/// dependencies of the crate it names besides `crates`.
+fn names_others(tree: &Tree, of: &Sources, module: &str, crates: &[&str], modules: &[&str]) -> Vec<String> {
+    let manifest = &tree.members()[of.name];
+    let others: Vec<String> = built_with(manifest)
+        .filter(|name| !crates.contains(&name.as_str()))
+        .map(|name| name.replace('-', "_"))
+        .collect();
+    let (file, folder) = (format!("{}/{module}.rs", of.folder), format!("{}/{module}/", of.folder));
+    let mut breaches = Vec::new();
+    for (path, text) in tree.sources().filter(|(path, _)| *path == file || path.starts_with(&folder)) {
+        for (number, line) in code(text) {
+            let line = line.replace("pub(crate)", "pub");
+            // Every mention of the crate is a path to an allowed module, not an alias and not a list.
+            let is_allowed = |rest: &str| {
+                let next = rest.strip_prefix("::").and_then(|rest| words(rest).next()).unwrap_or_default();
+                next == module || modules.contains(&next)
+            };
+            let leaves = words(&line).filter(|word| *word == "crate").count()
+                != line.match_indices("crate::").filter(|(at, _)| is_allowed(&line[at + 5..])).count()
+                || line.contains("super::super")
+                || path == file && words(&line).any(|word| word == "super");
+            if leaves || words(&line).any(|word| others.iter().any(|other| other == word)) {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
     breaches
 }
 
@@ -375,10 +426,11 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
         reached.insert(name);
     }
-    const STRANGERS: [&str; 6] = [
+    const STRANGERS: [&str; 7] = [
         "scanhub-client",
         "scanhub-lan",
         "scanhub-verbs",
+        "scanhub-viewer",
         "scanhub-sim",
         "scanhub-tools",
         "scanhub-lms-configure",
@@ -390,7 +442,7 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
     let ends: [&[&str]; 4] = [
         &["scanhub-daemon"],
-        &["scanhub-client", "scanhub-lan", "scanhub-verbs"],
+        &["scanhub-client", "scanhub-lan", "scanhub-verbs", "scanhub-viewer"],
         &["scanhub-sim"],
         &["scanhub-tools"],
     ];

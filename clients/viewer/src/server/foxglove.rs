@@ -1,0 +1,185 @@
+//! The wire of `foxglove.sdk.v1`: what server and viewers say over the WebSocket
+//! (<https://github.com/foxglove/ws-protocol>). Bytes in, bytes out; refuses to know sockets and what messages mean.
+
+use serde::{Deserialize, Serialize};
+
+use crate::server::board::Channel;
+use crate::server::playback::Order;
+
+/// The subprotocols of the WebSocket, the preferred one first. The second is the name of the first before Foxglove had an SDK;
+/// clients that know that name alone (npm's `@foxglove/ws-protocol`, older ones of Lichtblick) say and hear the same.
+pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
+
+/// What the server says first.
+pub(crate) fn server_info(session: &str) -> String {
+    text(&serde_json::json!({
+        "op": "serverInfo",
+        "name": format!("scanhub {}", env!("CARGO_PKG_VERSION")),
+        "capabilities": [],
+        "metadata": {},
+        "sessionId": session,
+    }))
+}
+
+/// Says which channels there are, by their numbers.
+pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>) -> String {
+    #[derive(Serialize)]
+    #[serde(rename_all = "camelCase")]
+    struct Advertised<'a> {
+        id: usize,
+        topic: &'a str,
+        encoding: &'a str,
+        schema_name: &'a str,
+        schema: &'a str,
+        schema_encoding: &'a str,
+    }
+    let channels: Vec<_> = channels
+        .map(|(at, channel)| Advertised {
+            id: at + 1,
+            topic: &channel.topic,
+            encoding: channel.encoding,
+            schema_name: channel.schema_name,
+            schema: channel.schema,
+            schema_encoding: channel.schema_encoding,
+        })
+        .collect();
+    text(&serde_json::json!({ "op": "advertise", "channels": channels }))
+}
+
+/// There is no such channel.
+pub(crate) fn unknown_channel(at: usize) -> String {
+    const ERROR: u8 = 2;
+    let message = format!("Unknown channel ID: {}", at.wrapping_add(1));
+    text(&serde_json::json!({ "op": "status", "level": ERROR, "message": message }))
+}
+
+/// A warning that viewers show until another one with this `id` comes.
+pub(crate) fn warning(id: &str, message: &str) -> String {
+    const WARNING: u8 = 1;
+    text(&serde_json::json!({ "op": "status", "level": WARNING, "message": message, "id": id }))
+}
+
+/// A message of a subscription, of a moment in ns since 1970.
+pub(crate) fn message(subscription: u32, wall_ns: u64, payload: &[u8]) -> Vec<u8> {
+    const MESSAGE_DATA: u8 = 1;
+    let mut frame = Vec::with_capacity(13 + payload.len());
+    frame.push(MESSAGE_DATA);
+    frame.extend(subscription.to_le_bytes());
+    frame.extend(wall_ns.to_le_bytes());
+    frame.extend(payload);
+    frame
+}
+
+/// What a viewer asks for.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Wish {
+    /// Messages of channels, each by the number of the subscription and of the channel's place.
+    Subscribe(Vec<(u32, usize)>),
+    /// No more of these subscriptions.
+    Unsubscribe(Vec<u32>),
+    /// Something of the player, where there is one; this protocol's own players neither step nor double.
+    Player(Order),
+}
+
+/// What a viewer says; nothing if it is about what this server did not offer.
+pub(crate) fn parse(text: &str) -> Option<Wish> {
+    #[derive(Deserialize)]
+    #[serde(tag = "op", rename_all = "camelCase")]
+    enum Said {
+        Subscribe {
+            subscriptions: Vec<Subscription>,
+        },
+        #[serde(rename_all = "camelCase")]
+        Unsubscribe {
+            subscription_ids: Vec<u32>,
+        },
+        #[serde(rename = "scanhub.player")]
+        Player {
+            order: Order,
+        },
+    }
+    #[derive(Deserialize)]
+    #[serde(rename_all = "camelCase")]
+    struct Subscription {
+        id: u32,
+        channel_id: usize,
+    }
+    Some(match serde_json::from_str(text).ok()? {
+        Said::Subscribe { subscriptions } => {
+            // Channels are numbered from 1 on.
+            let place = |one: Subscription| (one.id, one.channel_id.wrapping_sub(1));
+            Wish::Subscribe(subscriptions.into_iter().map(place).collect())
+        }
+        Said::Unsubscribe { subscription_ids } => Wish::Unsubscribe(subscription_ids),
+        Said::Player { order } => Wish::Player(order),
+    })
+}
+
+fn text(value: &impl Serialize) -> String {
+    serde_json::to_string(value).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_viewers_say_is_understood_and_all_else_is_nothing() {
+        let subscribe =
+            r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1},{"id":8,"channelId":0}]}"#;
+        assert_eq!(parse(subscribe), Some(Wish::Subscribe(vec![(7, 0), (8, usize::MAX)])));
+        let unsubscribe = r#"{"op":"unsubscribe","subscriptionIds":[7]}"#;
+        assert_eq!(parse(unsubscribe), Some(Wish::Unsubscribe(vec![7])));
+        let step = r#"{"op":"scanhub.player","order":"step"}"#;
+        assert_eq!(parse(step), Some(Wish::Player(Order::Step)));
+        let deep = "[".repeat(100_000);
+        for other in ["", "{}", r#"{"op":"getParameters"}"#, r#"{"op":"subscribe"}"#, &deep] {
+            assert_eq!(parse(other), None);
+        }
+    }
+
+    /// What PyPI's foxglove-sdk 0.30.3 said as a server, of the same channel and message.
+    #[test]
+    fn foxgloves_own_server_says_the_same() {
+        let channel = Channel {
+            topic: "/front/status".into(),
+            encoding: "json",
+            schema_name: "scanhub.Status",
+            schema_encoding: "jsonschema",
+            schema: r#"{"type":"object"}"#,
+            is_kept: true,
+        };
+        let value = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+        let theirs = r#"{"op":"advertise","channels":[{"id":1,"topic":"/front/status","encoding":"json",
+            "schemaName":"scanhub.Status","schemaEncoding":"jsonschema","schema":"{\"type\":\"object\"}"}]}"#;
+        assert_eq!(value(&advertise([(0, &channel)].into_iter())), value(theirs));
+        let theirs = r#"{"op":"status","level":2,"message":"Unknown channel ID: 99"}"#;
+        assert_eq!(value(&unknown_channel(98)), value(theirs));
+        let theirs = "01070000001581e97df41022117b2261223a317d";
+        let ours = message(7, 1_234_567_890_123_456_789, br#"{"a":1}"#);
+        assert_eq!(ours.iter().map(|byte| format!("{byte:02x}")).collect::<String>(), theirs);
+        let keys = |text: &str| value(text).as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        let theirs =
+            r#"{"op":"serverInfo","name":"","capabilities":[],"metadata":{},"sessionId":"1795475253384"}"#;
+        assert_eq!(keys(&server_info("1")), keys(theirs));
+    }
+
+    #[test]
+    fn what_the_server_says_has_the_protocols_keys() {
+        let channel = Channel {
+            topic: "/front/scan".into(),
+            encoding: "cdr",
+            schema_name: "sensor_msgs/msg/LaserScan",
+            schema_encoding: "ros2msg",
+            schema: "x",
+            is_kept: false,
+        };
+        let said: serde_json::Value = serde_json::from_str(&advertise([(0, &channel)].into_iter())).unwrap();
+        let channels = serde_json::json!([{"id": 1, "topic": "/front/scan", "encoding": "cdr",
+            "schemaName": "sensor_msgs/msg/LaserScan", "schema": "x", "schemaEncoding": "ros2msg"}]);
+        assert_eq!((&said["op"], &said["channels"]), (&"advertise".into(), &channels));
+        let info: serde_json::Value = serde_json::from_str(&server_info("5")).unwrap();
+        assert_eq!((&info["op"], &info["sessionId"]), (&"serverInfo".into(), &"5".into()));
+        assert_eq!(message(0x0403_0201, 9, b"ab"), [1, 1, 2, 3, 4, 9, 0, 0, 0, 0, 0, 0, 0, b'a', b'b']);
+    }
+}

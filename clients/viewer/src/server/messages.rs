@@ -1,0 +1,331 @@
+//! What a scene becomes on the wire: the channels, and the bytes of their messages. Scans and poses are ROS's, which every
+//! viewer draws; circles and marks are Foxglove's; states and the verdict are objects of JSON. Refuses to know viewers.
+
+mod replay;
+mod scene_update;
+mod tilt;
+
+use crate::scene::{Scene, Sensor, Trouble, rooms};
+use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
+use scanhub_schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
+use serde::Serialize;
+
+use crate::server::board::Channel;
+
+pub use replay::{replay, replay_channel};
+pub use scene_update::{lines, marks, obstacles, tracks, zones};
+pub use tilt::{tilt, tilt_channel};
+
+/// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
+pub fn scan_channel(sensor: &str) -> Channel {
+    of_ros(scan_topic(sensor), LASER_SCAN, false)
+}
+
+/// What stands before the background of a sensor, as `sensor_msgs/msg/PointCloud2`.
+pub fn foreground_channel(sensor: &str) -> Channel {
+    of_ros(beside_scan(sensor, "foreground"), POINT_CLOUD, false)
+}
+
+/// The learned background of a sensor, as a `sensor_msgs/msg/LaserScan` that nobody measured.
+pub fn background_channel(sensor: &str) -> Channel {
+    of_ros(beside_scan(sensor, "background"), LASER_SCAN, true)
+}
+
+/// Where the sensors sit, as `tf2_msgs/msg/TFMessage`.
+pub fn transforms_channel() -> Channel {
+    of_ros(TF_STATIC.to_owned(), TF_MESSAGE, true)
+}
+
+/// The circles around the robot, and the beams that violate them, as `foxglove.SceneUpdate`.
+pub fn zones_channel() -> Channel {
+    scene_update::channel("/zones")
+}
+
+/// Reflector marks, as `foxglove.SceneUpdate`.
+pub fn marks_channel() -> Channel {
+    scene_update::channel("/marks")
+}
+
+/// The straight surfaces that the sensors see, and their corners, as `foxglove.SceneUpdate`.
+pub fn lines_channel() -> Channel {
+    scene_update::channel("/lines")
+}
+
+/// The people of `tracker` and their tails, as `foxglove.SceneUpdate`.
+pub fn tracks_channel(tracker: &str) -> Channel {
+    scene_update::channel(&beside_scan(tracker, "tracks"))
+}
+
+/// The points of whole sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
+pub fn cloud_channel(name: &str) -> Channel {
+    of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
+}
+
+/// What the last sweep has found, as `foxglove.SceneUpdate`. Not for who comes later: it holds from when it comes.
+pub fn obstacles_channel(name: &str) -> Channel {
+    Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
+}
+
+/// The verdict and the hub, see [`robot`].
+pub fn robot_channel() -> Channel {
+    json("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
+}
+
+/// The state of a sensor, see [`status`].
+pub fn status_channel(sensor: &str) -> Channel {
+    json(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
+}
+
+/// The verdict of the robot's sensors, whether they are shown in a map, how its hub is, and how many people are in which room, in
+/// words; `trouble` is why there is no hub.
+pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> {
+    #[derive(Serialize)]
+    struct Robot<'a> {
+        verdict: &'a str,
+        sensor: Option<&'a str>,
+        nearest_m: Option<f64>,
+        domain: &'a str,
+        hub: bool,
+        pid: Option<u32>,
+        load_percent: Option<f64>,
+        hub_words: String,
+        map: bool,
+        people: Option<String>,
+        trouble: Option<Words<'a>>,
+    }
+    let (verdict, sensor, nearest_mm) = crate::scene::verdict(scene.robot().map(|(_, sensor)| sensor));
+    bytes(&Robot {
+        verdict: verdict.name(),
+        sensor,
+        nearest_m: nearest_mm.map(|mm| f64::from(mm) / 1000.0),
+        domain,
+        hub: scene.hub_lives,
+        pid: (scene.hub_pid != 0).then_some(scene.hub_pid),
+        load_percent: scene.hub_percent,
+        hub_words: hub_words(scene, domain),
+        map: scene.is_in_map(),
+        people: rooms(scene.people()),
+        trouble: trouble.map(Words::of),
+    })
+}
+
+/// How the hub is, in words.
+fn hub_words(scene: &Scene, domain: &str) -> String {
+    if !scene.hub_lives {
+        return "no hub".to_owned();
+    }
+    let pid = if scene.hub_pid == 0 { String::new() } else { format!(", hub process {}", scene.hub_pid) };
+    let load = scene.hub_percent.map_or(String::new(), |load| format!(", CPU {load:.1} %"));
+    format!("domain {domain}{pid}{load}")
+}
+
+/// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a simulator
+/// or a recording.
+pub fn status(sensor: &Sensor) -> Vec<u8> {
+    #[derive(Serialize)]
+    struct Told<'a> {
+        name: &'a str,
+        state: &'a str,
+        family: Option<&'a str>,
+        model: Option<String>,
+        port: Option<&'a str>,
+        remote: bool,
+        pose: Option<Place>,
+        hz: Option<f64>,
+        lost: u64,
+        lost_on_line: Option<u64>,
+        lost_share: Option<f64>,
+        damaged: f64,
+        suspect: u64,
+        age_p50_ms: Option<f64>,
+        age_p99_ms: Option<f64>,
+        frozen: bool,
+        simulated: bool,
+        replayed: bool,
+        taught: Option<u32>,
+        objects: Option<usize>,
+        marks: Option<usize>,
+        verdict: &'a str,
+        nearest_m: Option<f64>,
+        trouble: Option<Words<'a>>,
+    }
+    #[derive(Serialize)]
+    struct Place {
+        x_m: f64,
+        y_m: f64,
+        yaw_rad: f64,
+        upside_down: bool,
+    }
+    let place = |Pose { x_m, y_m, yaw_rad, upside_down, .. }| Place {
+        x_m,
+        y_m,
+        yaw_rad,
+        upside_down: upside_down != 0,
+    };
+    let status = sensor.status.as_ref();
+    let ages = sensor.meter.age_percentiles_ms();
+    let trouble = sensor.trouble();
+    bytes(&Told {
+        name: &sensor.name,
+        state: sensor.state(),
+        family: status.and_then(|status| status.family()).map(|family| family.name()),
+        model: status.and_then(|status| status.model()),
+        port: status.map(|status| status.port()).filter(|port| !port.is_empty()),
+        remote: is_remote(&sensor.name),
+        pose: sensor.mount.pose().map(place),
+        hz: sensor.meter.hz(),
+        lost: sensor.lost,
+        lost_on_line: status.and_then(|status| status.lost_on_line()),
+        lost_share: status.and_then(|status| status.lost_share()),
+        damaged: status.map_or(0.0, |status| status.damaged()),
+        suspect: sensor.count(Counter::Suspect),
+        age_p50_ms: ages.map(|(half, _)| half),
+        age_p99_ms: ages.map(|(_, most)| most),
+        frozen: sensor.is_frozen(),
+        simulated: sensor.is_simulated(),
+        replayed: sensor.is_replayed(),
+        taught: sensor.background.as_ref().map(|model| u32::from(model.taught)),
+        objects: sensor.foreground.as_ref().map(|foreground| foreground.segments().len()),
+        marks: sensor.marks.map(|marks| marks.marks().len()),
+        verdict: sensor.zones.verdict().name(),
+        nearest_m: sensor.zones.nearest().map(|(_, mm)| f64::from(mm) / 1000.0),
+        trouble: trouble.as_ref().map(Words::of),
+    })
+}
+
+/// The background of `sensor` as the scan that it would be: nan where nothing is known, +inf where it is too far to see.
+pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
+    const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
+    let as_scan = |range: &u16| match *range {
+        Background::UNTAUGHT => NOT_MEASURED,
+        Background::FAR => BEYOND,
+        range => range.min(BEYOND - 1),
+    };
+    let ranges: Vec<u16> = model.ranges().iter().map(as_scan).collect();
+    let head = ScanHead {
+        first_angle: model.first_angle,
+        step: model.step,
+        unit_um: model.unit_um,
+        valid_to: BEYOND - 1,
+        no_return: BEYOND,
+        beyond: BEYOND,
+        ..ScanHead::default()
+    };
+    let header = Header { wall_ns, ..Header::default() };
+    scanhub_ros::laser_scan(message, scanhub_ros::frame(sensor), &header, &Scan::of(head, &ranges));
+}
+
+/// Stands for a range that no sensor measures.
+const BEYOND: u16 = u16::MAX - 1;
+
+/// Where the sensors of `scene` sit, as far as that was told.
+pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+    let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.mount.pose()?));
+    let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
+    let mut message = Vec::new();
+    scanhub_ros::static_transforms(&mut message, wall_ns, &poses);
+    message
+}
+
+#[derive(Serialize)]
+struct Words<'a> {
+    what: &'a str,
+    remedy: &'a str,
+}
+
+impl Words<'_> {
+    fn of(trouble: &Trouble) -> Words<'_> {
+        Words { what: &trouble.what, remedy: &trouble.remedy }
+    }
+}
+
+/// The topic `word` in the namespace of the sensor's scans.
+fn beside_scan(sensor: &str, word: &str) -> String {
+    let topic = scan_topic(sensor);
+    format!("{}{word}", topic.strip_suffix("scan").unwrap_or(&topic))
+}
+
+fn of_ros(topic: String, kind: Type, is_kept: bool) -> Channel {
+    let Type { name, text } = kind;
+    Channel {
+        topic,
+        encoding: Type::ENCODING,
+        schema_name: name,
+        schema_encoding: Type::LANGUAGE,
+        schema: text,
+        is_kept,
+    }
+}
+
+fn json(topic: String, schema_name: &'static str, schema: &'static str) -> Channel {
+    Channel { topic, encoding: "json", schema_name, schema_encoding: "jsonschema", schema, is_kept: true }
+}
+
+fn bytes(value: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(value).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use scanhub_ros::read;
+    use scanhub_schema::BackgroundHead;
+
+    #[test]
+    fn a_background_is_a_scan_of_what_is_known() {
+        let head =
+            BackgroundHead { first_angle: -1.0, step: 0.5, unit_um: 1000, ..BackgroundHead::default() };
+        let model = Background::of(head, &[4000, Background::UNTAUGHT, Background::FAR]);
+        let mut message = Vec::new();
+        background(&mut message, "front", 7, &model);
+        let told = read(&LASER_SCAN, &message).unwrap();
+        assert_eq!((told.text("header.frame_id"), told.number("ranges.0")), (Some("front"), Some(4.0)));
+        assert!(told.number("ranges.1").unwrap().is_nan());
+        assert_eq!(told.number("ranges.2"), Some(f64::INFINITY));
+    }
+
+    #[test]
+    fn what_is_not_known_is_null_and_the_verdict_unknown() {
+        let mut scene = Scene::default();
+        let object = |bytes: Vec<u8>| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap();
+        let told = object(robot(&scene, "default", None));
+        assert_eq!((&told["verdict"], &told["hub"]), (&"unknown".into(), &false.into()));
+        assert_eq!((&told["hub_words"], &told["people"]), (&"no hub".into(), &serde_json::Value::Null));
+        let told = object(status(scene.sensor("front")));
+        assert_eq!((&told["state"], &told["hz"]), (&"unheard".into(), &serde_json::Value::Null));
+        assert_eq!(told["pose"], serde_json::Value::Null, "nobody told where it sits");
+        assert_eq!(told["trouble"]["what"], "nothing was heard of it yet");
+    }
+
+    #[test]
+    fn a_hub_in_words() {
+        let mut scene = Scene { hub_lives: true, ..Scene::default() };
+        assert_eq!(hub_words(&scene, "default"), "domain default");
+        (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));
+        assert_eq!(hub_words(&scene, "default"), "domain default, hub process 77, CPU 1.3 %");
+    }
+
+    #[test]
+    fn every_message_has_the_keys_that_its_schema_tells() {
+        let mut scene = Scene::default();
+        scene.sensor("front");
+        let keys = |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        let pairs = [
+            (robot_channel(), robot(&scene, "default", None)),
+            (status_channel("front"), status(&scene.sensors[0])),
+            (zones_channel(), zones(&scene, 1)),
+            (marks_channel(), marks(&scene, 1)),
+            (lines_channel(), lines(&scene, 1)),
+            (tracks_channel("house"), tracks(&crate::scene::People::default(), 1)),
+            (replay_channel(), replay(&crate::server::Progress::default())),
+            (tilt_channel("mount"), tilt(&scanhub_schema::Tilt::default())),
+            (obstacles_channel("hall"), obstacles(&Header::default(), &scanhub_schema::Obstacles::default())),
+        ];
+        for (channel, message) in pairs {
+            let schema: serde_json::Value = serde_json::from_str(channel.schema).unwrap();
+            let message: serde_json::Value = serde_json::from_slice(&message).unwrap();
+            assert_eq!(keys(&schema["properties"]), keys(&message), "{}", channel.topic);
+        }
+        assert_eq!(status_channel("hub1.front").topic, "/hub1/front/status");
+    }
+}

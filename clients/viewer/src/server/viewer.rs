@@ -1,0 +1,361 @@
+//! One viewer at its WebSocket: its subscriptions, and the message that it gets next. Few bytes are in flight, so memory is
+//! bounded, and a viewer that was slow continues with the newest messages.
+
+use std::io;
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use tungstenite::protocol::{Role, WebSocketConfig};
+use tungstenite::{Bytes, Error, Message, WebSocket};
+
+use crate::server::board::{Board, Queued};
+use crate::server::foxglove::{self, Wish};
+use crate::server::playback::Playback;
+
+/// Maximum number of subscriptions of a viewer.
+const SUBSCRIPTIONS: usize = 256;
+/// Maximum length of a message from a viewer, in bytes: enough to subscribe to everything.
+const LONGEST: usize = 64 << 10;
+/// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other viewers.
+const HEARD: usize = 32;
+/// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
+const PIECE: usize = 16 << 10;
+/// Send timeout. A viewer that does not accept a message in this time is disconnected.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Minimum interval between two reports of skipped messages.
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
+
+/// A connected viewer.
+pub(crate) struct Viewer {
+    socket: WebSocket<TcpStream>,
+    subscriptions: Vec<Subscription>,
+    /// Number of channels that were advertised.
+    advertised: usize,
+    /// Subscription that is served next.
+    next: usize,
+    /// Time since when the socket does not accept all bytes.
+    pending: Option<Instant>,
+    /// Whether the socket was full since this viewer last had all messages.
+    was_full: bool,
+    skipped: Skipped,
+    reported: Skipped,
+    report_at: Instant,
+    /// The last subscription to an unknown channel, which was not refused yet.
+    unknown: Option<usize>,
+    /// Whether unread messages may be left, even if the socket receives nothing new.
+    hears_more: bool,
+}
+
+struct Subscription {
+    id: u32,
+    channel: usize,
+    /// Number of the last message that was sent, or that was older than the subscription.
+    number: u64,
+}
+
+/// Messages that were replaced by newer ones before they were sent.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Skipped {
+    /// Messages that the viewer, or the network to it, was too slow for.
+    by_viewer: u64,
+    /// Messages that this process was too late for.
+    by_server: u64,
+}
+
+/// The viewer has disconnected, or has to be disconnected.
+#[derive(Debug)]
+pub(crate) struct Gone;
+
+impl Viewer {
+    /// Creates a viewer after its handshake. `early` are the bytes that it sent after the handshake.
+    pub(crate) fn new(
+        stream: TcpStream,
+        early: Vec<u8>,
+        session: &str,
+        now: Instant,
+    ) -> Result<Viewer, Gone> {
+        let config = WebSocketConfig::default()
+            .read_buffer_size(4096)
+            .write_buffer_size(2 * PIECE)
+            .max_message_size(Some(LONGEST))
+            .max_frame_size(Some(LONGEST));
+        let mut viewer = Viewer {
+            socket: WebSocket::from_partially_read(stream, early, Role::Server, Some(config)),
+            subscriptions: Vec::new(),
+            advertised: 0,
+            next: 0,
+            pending: None,
+            was_full: false,
+            skipped: Skipped::default(),
+            reported: Skipped::default(),
+            report_at: now,
+            unknown: None,
+            hears_more: true,
+        };
+        viewer.send(Message::text(foxglove::server_info(session)), now)?;
+        viewer.flush(now)?;
+        Ok(viewer)
+    }
+
+    pub(crate) fn stream(&self) -> &TcpStream {
+        self.socket.get_ref()
+    }
+
+    /// Returns whether the socket does not accept all bytes.
+    pub(crate) fn is_pending(&self) -> bool {
+        self.pending.is_some()
+    }
+
+    /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not count.
+    pub(crate) fn skipped(&self) -> u64 {
+        self.skipped.by_viewer + self.skipped.by_server
+    }
+
+    /// Returns whether [`hear`](Self::hear) may have left messages unread.
+    pub(crate) fn hears_more(&self) -> bool {
+        self.hears_more
+    }
+
+    /// Returns when the viewer next needs service even without input, such as for a timeout.
+    pub(crate) fn wake_at(&self) -> Option<Instant> {
+        let gives_up = self.pending.map(|since| since + PATIENCE);
+        let reports = (self.skipped != self.reported).then_some(self.report_at);
+        let hears = self.hears_more.then(Instant::now);
+        gives_up.into_iter().chain(reports).chain(hears).min()
+    }
+
+    /// Handles messages from the viewer, up to [`HEARD`].
+    pub(crate) fn hear(&mut self, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
+        self.hears_more = false;
+        for _ in 0..HEARD {
+            match self.socket.read() {
+                Ok(Message::Text(text)) => self.obey(foxglove::parse(&text), board, player)?,
+                Ok(Message::Close(_)) => return Err(Gone),
+                Ok(_) => {}
+                Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
+                Err(_) => return Err(Gone),
+            }
+        }
+        self.hears_more = true;
+        Ok(())
+    }
+
+    fn obey(&mut self, wish: Option<Wish>, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
+        match wish {
+            Some(Wish::Subscribe(wanted)) => {
+                for (id, channel) in wanted {
+                    if self.subscriptions.iter().any(|one| one.id == id) {
+                        continue;
+                    }
+                    if self.subscriptions.len() >= SUBSCRIPTIONS {
+                        return Err(Gone);
+                    }
+                    let Some(number) = board.subscribe(channel) else {
+                        self.unknown = Some(channel);
+                        continue;
+                    };
+                    self.subscriptions.push(Subscription { id, channel, number });
+                }
+            }
+            Some(Wish::Unsubscribe(ids)) => {
+                let (gone, left) = std::mem::take(&mut self.subscriptions)
+                    .into_iter()
+                    .partition(|one: &Subscription| ids.contains(&one.id));
+                self.subscriptions = left;
+                gone.iter().for_each(|one| board.unsubscribe(one.channel));
+            }
+            Some(Wish::Player(order)) => player.into_iter().for_each(|player| player.order(order)),
+            None => {}
+        }
+        Ok(())
+    }
+
+    /// Sends what the viewer has to get until the socket is full.
+    pub(crate) fn serve(&mut self, board: &Board, now: Instant) -> Result<(), Gone> {
+        self.flush(now)?;
+        while !self.is_pending() {
+            if !self.gather(board, now)? {
+                return Ok(());
+            }
+            self.flush(now)?;
+        }
+        Ok(())
+    }
+
+    /// Buffers about [`PIECE`] bytes for the viewer. Returns whether there are any.
+    fn gather(&mut self, board: &Board, now: Instant) -> Result<bool, Gone> {
+        let mut length = 0;
+        while length < PIECE {
+            let channels = board.channels_from(self.advertised);
+            if !channels.is_empty() {
+                self.advertised += channels.len();
+                length += PIECE;
+                let told = foxglove::advertise(channels.iter().map(|(at, channel)| (*at, &**channel)));
+                self.send(Message::text(told), now)?;
+            } else if let Some(channel) = self.unknown.take() {
+                length += PIECE;
+                self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
+            } else if self.skipped != self.reported && now >= self.report_at {
+                self.reported = self.skipped;
+                self.report_at = now + REPORT_INTERVAL;
+                length += PIECE;
+                self.send(Message::text(foxglove::warning("skipped", &self.skipped.text())), now)?;
+            } else if let Some((id, queued)) = self.choose(board) {
+                let frame = foxglove::message(id, queued.wall_ns, &queued.payload);
+                length += frame.len();
+                self.send(Message::Binary(Bytes::from(frame)), now)?;
+            } else {
+                break;
+            }
+        }
+        Ok(length > 0)
+    }
+
+    /// Returns the next message and its subscription. Subscriptions take turns.
+    fn choose(&mut self, board: &Board) -> Option<(u32, Queued)> {
+        let count = self.subscriptions.len();
+        for step in 0..count {
+            let at = (self.next + step) % count;
+            let subscription = &mut self.subscriptions[at];
+            let Some(queued) = board.next(subscription.channel, subscription.number) else { continue };
+            if !queued.is_kept {
+                let skipped = queued.number - subscription.number - 1;
+                let Skipped { by_viewer, by_server } = &mut self.skipped;
+                *(if self.was_full { by_viewer } else { by_server }) += skipped;
+            }
+            subscription.number = queued.number;
+            self.next = at + 1;
+            return Some((subscription.id, queued));
+        }
+        self.was_full = false;
+        None
+    }
+
+    /// Buffers `message`, and may send some of the buffer.
+    fn send(&mut self, message: Message, now: Instant) -> Result<(), Gone> {
+        match self.socket.write(message) {
+            Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Gone),
+            Ok(()) | Err(Error::Io(_)) => {}
+            Err(_) => return Err(Gone),
+        }
+        self.pending.get_or_insert(now);
+        Ok(())
+    }
+
+    fn flush(&mut self, now: Instant) -> Result<(), Gone> {
+        let Some(since) = self.pending else { return Ok(()) };
+        match self.socket.flush() {
+            Ok(()) => self.pending = None,
+            Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => self.was_full = true,
+            Err(_) => return Err(Gone),
+        }
+        if self.is_pending() && now - since >= PATIENCE { Err(Gone) } else { Ok(()) }
+    }
+
+    /// Ends the subscriptions.
+    pub(crate) fn leave(&mut self, board: &Board) {
+        self.subscriptions.drain(..).for_each(|one| board.unsubscribe(one.channel));
+    }
+}
+
+impl Skipped {
+    /// Returns the report for the viewer.
+    fn text(self) -> String {
+        let Skipped { by_viewer, by_server } = self;
+        let viewer = format!("{by_viewer} messages skipped: this viewer or its network is too slow");
+        let server =
+            format!("{by_server} messages skipped: the server was too late, its machine may be busy");
+        match (by_viewer, by_server) {
+            (_, 0) => viewer,
+            (0, _) => server,
+            _ => format!("{viewer}; {server}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::server::board::Channel;
+    use std::net::TcpListener;
+
+    /// Returns both ends of a viewer's connection.
+    fn pair(now: Instant) -> (Viewer, WebSocket<TcpStream>) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        client.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        let (server, _) = listener.accept().unwrap();
+        server.set_nonblocking(true).unwrap();
+        let viewer = Viewer::new(server, Vec::new(), "1", now).unwrap();
+        (viewer, WebSocket::from_raw_socket(client, Role::Client, None))
+    }
+
+    #[test]
+    fn a_slow_viewer_gets_the_newest_message_and_a_report_of_the_skipped_ones() {
+        let (board, now) = (Board::new().unwrap(), Instant::now());
+        let scans = board.channel(Channel {
+            topic: "/front/scan".into(),
+            encoding: "cdr",
+            schema_name: "S",
+            schema_encoding: "ros2msg",
+            schema: "",
+            is_kept: false,
+        });
+        let (mut viewer, mut client) = pair(now);
+        let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
+        client.send(Message::text(subscribe)).unwrap();
+        while !board.is_wanted(scans) {
+            viewer.hear(&board, None).unwrap();
+        }
+        let put = |number: u32| {
+            board.put(scans, 1, &[&number.to_le_bytes()[..], &[0; 100_000]].concat());
+        };
+        let mut receive = || match client.read().unwrap() {
+            Message::Binary(frame) => Ok(u32::from_le_bytes(frame[13..17].try_into().unwrap())),
+            Message::Text(text) => Err(text.to_string()),
+            other => panic!("{other:?}"),
+        };
+        // The server is late, and the queue is too short.
+        (1..=40).for_each(put);
+        viewer.serve(&board, now).unwrap();
+        let (newest, report) = loop {
+            match receive() {
+                Ok(number) => break (number, receive().unwrap_err()),
+                Err(other) => assert!(!other.contains("skipped"), "{other}"),
+            }
+        };
+        assert_eq!((newest, viewer.skipped()), (40, 39));
+        assert!(report.contains("39 messages skipped: the server was too late"), "{report}");
+        // The viewer does not read, so the buffers of the sockets fill.
+        let (mut last, now) = (40, now + REPORT_INTERVAL);
+        while !viewer.is_pending() {
+            last += 1;
+            put(last);
+            viewer.serve(&board, now).unwrap();
+        }
+        for _ in 0..40 {
+            last += 1;
+            put(last);
+            viewer.serve(&board, now).unwrap();
+        }
+        let (mut numbers, mut report) = (vec![newest], String::new());
+        while report.is_empty() || numbers.last() != Some(&last) {
+            viewer.serve(&board, now).unwrap();
+            match receive() {
+                Ok(number) => numbers.push(number),
+                Err(text) => report = text,
+            }
+        }
+        let received = numbers.len() as u64;
+        assert!(numbers.is_sorted() && received + viewer.skipped() == u64::from(last), "{numbers:?}");
+        let skipped = format!("{} messages skipped: this viewer", viewer.skipped() - 39);
+        assert!(viewer.skipped() > 39 && report.contains(&skipped), "{report}");
+        // A viewer that never reads is disconnected.
+        while !viewer.is_pending() {
+            last += 1;
+            put(last);
+            viewer.serve(&board, now).unwrap();
+        }
+        assert!(viewer.serve(&board, now + PATIENCE).is_err());
+    }
+}
