@@ -1,4 +1,4 @@
-//! `scanhub echo`: samples as text, JSON, CSV or bytes. Refuses to know where they come from.
+//! `scanhub echo`: samples as text, JSON, CSV or bytes.
 
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
@@ -8,7 +8,7 @@ use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
 use scanhub_shm::Domain;
 
-use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::follow::{Bounds, Event, Following};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
@@ -59,7 +59,9 @@ pub fn echo(
     check(options.format, &named, &of_all)?;
     let mut echo =
         Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), beams: None };
-    quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut echo))
+    let mut following = Following::new(&named, &of_all, &options.places, &options.bounds, stop).with_lines();
+    let end = echo.run(&mut following);
+    quiet(following.finish(end, |name, stats| echo.summary(name, stats)))
 }
 
 struct Echo<'a> {
@@ -70,7 +72,20 @@ struct Echo<'a> {
     beams: Option<usize>,
 }
 
-impl Sink for Echo<'_> {
+impl Echo<'_> {
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
+                Event::Notice(names, notice) => {
+                    notice.tell(&names, self.format == Format::Json, &mut self.out, &mut self.notes)?;
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         match (self.format, sample) {
             (Format::Text, _) => self.out.line(|line| text::sample(line, name, sample)),
@@ -81,14 +96,6 @@ impl Sink for Echo<'_> {
         }
     }
 
-    fn wants_lines(&self) -> bool {
-        true
-    }
-
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        notice.tell(names, self.format == Format::Json, &mut self.out, &mut self.notes)
-    }
-
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         match self.format {
             Format::Json => self.out.json(&json::summary(name, stats)),
@@ -96,9 +103,7 @@ impl Sink for Echo<'_> {
             Format::Csv(_) | Format::Raw => self.notes.line(|line| text::summary(line, name, stats)),
         }
     }
-}
 
-impl Echo<'_> {
     /// A line of columns; the names of the columns first, and again if their number changes.
     fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), End> {
         if self.beams != Some(scan.beams()) {

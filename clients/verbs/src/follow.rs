@@ -1,31 +1,23 @@
-//! The loop of every verb that follows topics: receives, counts, reports problems, and ends at the bounds. Refuses to
-//! know how samples are used.
+//! Receives the topics of a verb: [`Following`] returns what arrives, one [`Event`] after the other, until the bounds are reached.
 
-mod discovery;
-mod lines;
-mod notice;
-mod shortage;
-mod track;
-
+use std::collections::VecDeque;
+use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{GRACE, Sample, Session, Who};
-use scanhub_client::{Wait, clock};
+use scanhub_client::streams::{Follower, GRACE, Sample, Session, Source, Who};
+use scanhub_client::{Received, Wait, clock};
 use scanhub_schema::{Failure, Kind, Status, Topic, is_remote};
 use scanhub_shm::Domain;
 
 use crate::discovery::Discovery;
-use crate::names::TopicName;
-use crate::output::End;
-use lines::{LineTrack, watch_parts};
-use shortage::Shortage;
-use track::Track;
-
+use crate::line::{Line, Loss};
+use crate::names::{TopicName, no_sensor, no_such_topic};
+use crate::output::{End, Output};
 pub use crate::receive_stats::ReceiveStats;
-pub use notice::Notice;
+use crate::{json, text};
 
-/// When a verb that follows ends by itself.
+/// When a verb that follows topics ends by itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Bounds {
     /// After so many samples, of all topics together (`-n`).
@@ -37,156 +29,192 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// The run ends by itself: no hub at its start is a failure, an interrupt too.
+    /// Returns whether the run ends by itself. Then it fails if there is no hub at its start, or if it is interrupted.
     pub fn bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
 }
 
-/// What a verb does with what it follows.
-pub trait Sink {
-    /// A topic will be followed.
-    fn begin(&mut self, _name: &TopicName) {}
-    /// The topic is there, and what is sent from now on will be received.
-    fn subscribed(&mut self, _name: &TopicName) {}
-    /// A sample was received just now; who it is from and what was missed before it comes next.
-    fn arrived(&mut self) {}
-    /// A sample came, or one that stands for a silence and does not count.
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
-    /// Something went wrong, or right again, in the streams of `names`; none as long as it is not known what is followed.
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End>;
-    /// Called about ten times a second and after every sample.
-    fn tick(&mut self, _now: Instant) -> Result<(), End> {
-        Ok(())
-    }
-    /// When [`tick`](Self::tick) has something to do before that.
-    fn wake_at(&self) -> Option<Instant> {
-        None
-    }
-    /// Whether `topic` is wanted now: what is not is not subscribed to.
-    fn wants(&self, _topic: Topic) -> bool {
-        true
-    }
-    /// Whether the statuses of what is followed are wanted too, for what its lines take away.
-    fn wants_lines(&self) -> bool {
-        false
-    }
-    /// Memory, descriptors or places are too short to follow `name`, which is tried again; unless it goes on without that, the
-    /// run ends.
-    fn short(&mut self, _name: &TopicName, failure: Failure) -> Result<(), End> {
-        Err(failure.into())
-    }
-    /// A status of `sensor` came.
-    fn line(&mut self, _sensor: &str, _status: &Status) -> Result<(), End> {
-        Ok(())
-    }
-    /// The run is over, for good or ill; nothing comes any more.
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End>;
+/// What arrives while a verb follows topics.
+pub enum Event {
+    /// The run follows this topic from now on.
+    Begun(Rc<TopicName>),
+    /// The hub has the topic. The run receives what is sent from now on.
+    Subscribed(Rc<TopicName>),
+    /// A sample, or one that stands for a silence and does not count. Drop it before the next event.
+    Sample(Rc<TopicName>, Sample, Arrival),
+    /// Something went wrong, or right again, in these topics. If there are none, nothing is known of the topics yet.
+    Notice(Vec<Rc<TopicName>>, Notice),
+    /// The run cannot follow this topic for lack of memory, descriptors or places, and will try again
+    /// ([`Following::despite_shortage`]).
+    Short(Rc<TopicName>, Failure),
+    /// A status of a sensor ([`Following::with_lines`]).
+    Line(String, Received<Status>),
+    /// Comes after each round of samples, and about ten times a second if there are none.
+    Tick(Instant),
 }
 
-/// Follows `names`, and `topics` of each sensor that a hub has when it comes, in the first live one of `places` until
-/// `bounds` or `stop` end it.
-pub fn follow(
-    names: &[TopicName],
-    topics: &[Topic],
-    places: &[Domain],
-    bounds: &Bounds,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<(), End> {
-    carry(Run::new(names, topics, places, bounds), names, stop, sink)
+/// When this process received a sample.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Arrival {
+    /// CLOCK_MONOTONIC, in ns.
+    pub monotonic_ns: u64,
+    /// The wall clock, in ns since 1970.
+    pub wall_ns: u64,
 }
 
-/// As [`follow`], and zones with the early warnings of their sensors.
-pub(crate) fn follow_with_early(
-    names: &[TopicName],
-    places: &[Domain],
-    bounds: &Bounds,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<(), End> {
-    let mut run = Run::new(names, &[], places, bounds);
-    run.tracks.iter_mut().for_each(Track::take_early);
-    carry(run, names, stop, sink)
+/// What went wrong in a stream, beside its samples.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Notice {
+    /// So many samples were sent and not received.
+    Missed(u64),
+    /// Nothing came for longer than the topic's samples are apart.
+    Stale,
+    /// No hub runs in the domain when the verb starts, so the verb waits for one. The failure names the places that were
+    /// searched, and the hubs of other users.
+    NoHub(Failure),
+    /// The hub of the domain has ended.
+    HubGone,
+    /// A hub lives in the domain again.
+    HubBack,
 }
 
-/// As [`follow`], woken by `wait`, and for the shortest latency: what is there is taken before it is asked whether the hub
-/// still is, which takes longer than receiving.
-pub(crate) fn follow_closely(
-    wait: Wait,
-    names: &[TopicName],
-    places: &[Domain],
-    bounds: &Bounds,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<(), End> {
-    let run = Run::new(names, &[], places, bounds);
-    carry(Run { session: run.session.by(wait), closely: true, ..run }, names, stop, sink)
-}
-
-fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), End> {
-    names.iter().for_each(|name| sink.begin(name));
-    let end = run.run(stop, sink);
-    if !matches!(end, Err(End::ReaderGone)) {
-        run.take_lines(sink)?;
-        for track in &run.tracks {
-            let mut stats = track.stats.clone();
-            stats.loss = run.loss(&track.name.sensor);
-            sink.summary(&track.name, &stats)?;
+impl Notice {
+    /// Tells it of `names`, or of the domain if there are none: lines of JSON to `out`, or text to `notes`.
+    pub fn tell(
+        &self,
+        names: &[Rc<TopicName>],
+        is_json: bool,
+        out: &mut Output<'_>,
+        notes: &mut Output<'_>,
+    ) -> Result<(), End> {
+        match is_json {
+            true => json::notices(out, names, self),
+            false => notes.line(|line| text::notice(line, names, self)),
         }
     }
-    end
 }
 
-struct Run<'a> {
+/// The topics that a verb follows, in the first of several domains where a hub lives.
+pub struct Following<'a> {
     session: Session,
-    tracks: Vec<Track>,
-    /// The lines of the sensors, if they are wanted, and for how many tracks that was looked after.
-    lines: Vec<LineTrack>,
-    lined: usize,
-    /// What is followed of each sensor that a hub has.
-    topics: &'a [Topic],
+    topics: Vec<Followed>,
+    /// The statuses of the followed sensors, if they are wanted, and for how many of `topics` they are followed.
+    lines: Option<Vec<FollowedLine>>,
+    topics_with_line: usize,
+    /// Which topics of each sensor of the hub the run follows.
+    of_all_sensors: &'a [Topic],
+    unwanted: Vec<Topic>,
     discovery: Discovery,
-    /// Samples come before news of the hub.
+    /// Whether samples come before news of the hub.
     closely: bool,
+    despite_shortage: bool,
     bounds: &'a Bounds,
+    stop: &'a AtomicBool,
+    stage: Stage,
+    round: Round,
+    events: VecDeque<Event>,
+    /// How the run ended. The events before that come first.
+    end: Option<Result<(), End>>,
     started: Instant,
     last_sample: Instant,
     hub_seen: Option<Instant>,
-    /// Since when there is a hub, and not only a listener, as far as it was looked at.
+    /// Since when a hub lives, and not only a listener, as far as the run looked.
     hub_lives_since: Option<Instant>,
-    /// When it was looked last which sensors there are.
+    /// When the run looked last which sensors there are.
     asked_at: Option<Instant>,
     waiting_said: bool,
     received: u64,
-    shortage: Shortage,
+    /// Until when the run subscribes to nothing, because memory, descriptors or places are short.
+    short_until: Option<Instant>,
 }
 
-/// Who brings the sensor that is called so.
-fn brings(sensor: &str) -> Who {
-    if is_remote(sensor) { Who::Listener } else { Who::Hub }
+/// What the run does next.
+#[derive(Clone, Copy, PartialEq)]
+enum Stage {
+    Start,
+    Look,
+    Receive,
+    AfterRound,
+    Check,
+    Wait,
 }
 
-/// Whether `who` publishes `name`; the sensors of a robot may come from any publisher.
-fn is_of(name: &TopicName, who: Who) -> bool {
-    name.is_robot() || brings(&name.sensor) == who
+/// How far a round over all topics is.
+#[derive(Default)]
+struct Round {
+    /// The topic that has its turn.
+    topic: usize,
+    /// How many samples it gave.
+    taken: usize,
+    /// The round has subscribed to a topic.
+    subscribed: bool,
+    /// Samples may be waiting after this round.
+    more: bool,
+}
+
+impl Round {
+    fn next_topic(&mut self) {
+        self.topic += 1;
+        self.taken = 0;
+    }
+}
+
+/// A topic of a sensor.
+struct Followed {
+    name: Rc<TopicName>,
+    source: Source,
+    stats: ReceiveStats,
+    /// CLOCK_MONOTONIC since when samples are received as they are sent, in ns.
+    since_ns: u64,
+}
+
+/// The serial line of a sensor. Its statuses are no samples of the run: no bound counts them, and the run does not fail without
+/// them.
+struct FollowedLine {
+    sensor: String,
+    /// `None` if its statuses cannot be received.
+    source: Option<Follower<Status>>,
+    line: Line,
 }
 
 /// Samples taken from one topic before the next one has its turn.
 const TURN: usize = 32;
+/// The listener has announced the sensors of other machines after so long: it announces them once a second.
+const ANNOUNCED: Duration = Duration::from_secs(3);
+/// How often the run looks which sensors there are while one is missing. A look takes milliseconds, in which samples wait.
+const ASK_EVERY: Duration = Duration::from_millis(500);
+/// How long the run subscribes to nothing after a shortage: a try takes as long as receiving a thousand samples.
+const SHORTAGE_PAUSE: Duration = Duration::from_secs(1);
 
-impl<'a> Run<'a> {
-    fn new(names: &[TopicName], topics: &'a [Topic], places: &[Domain], bounds: &'a Bounds) -> Run<'a> {
+impl<'a> Following<'a> {
+    /// Makes a run that follows `names`, and the topics `of_all` of each sensor that the hub has, in the first live one of `places`,
+    /// until `bounds` are reached or `stop` is set.
+    pub fn new(
+        names: &[TopicName],
+        of_all: &'a [Topic],
+        places: &[Domain],
+        bounds: &'a Bounds,
+        stop: &'a AtomicBool,
+    ) -> Following<'a> {
         let now = Instant::now();
-        Run {
+        let topics: Vec<_> = names.iter().map(|name| Followed::new(Rc::new(name.clone()))).collect();
+        Following {
             session: Session::new(places.to_vec()),
-            tracks: names.iter().cloned().map(Track::new).collect(),
-            lines: Vec::new(),
-            lined: 0,
+            events: topics.iter().map(|topic| Event::Begun(topic.name.clone())).collect(),
             topics,
+            lines: None,
+            topics_with_line: 0,
+            of_all_sensors: of_all,
+            unwanted: Vec::new(),
             discovery: Discovery::default(),
             closely: false,
+            despite_shortage: false,
             bounds,
+            stop,
+            stage: Stage::Start,
+            round: Round::default(),
+            end: None,
             started: now,
             last_sample: now,
             hub_seen: None,
@@ -194,132 +222,268 @@ impl<'a> Run<'a> {
             asked_at: None,
             waiting_said: false,
             received: 0,
-            shortage: Shortage::default(),
+            short_until: None,
         }
     }
 
-    fn run(&mut self, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<(), End> {
-        self.look(sink)?;
+    /// Follows the statuses of the sensors, too: for what their lines take away.
+    pub fn with_lines(self) -> Following<'a> {
+        Following { lines: Some(Vec::new()), ..self }
+    }
+
+    /// Receives zones with the early warnings of their sensors.
+    pub fn with_early(mut self) -> Following<'a> {
+        for topic in self.topics.iter_mut().filter(|topic| topic.name.topic == Topic::Zones) {
+            topic.source = Source::zones_with_early(&topic.name.sensor);
+        }
+        self
+    }
+
+    /// Is woken by `wait`, for the shortest latency: the run receives before it looks for the hub, which takes longer.
+    pub fn closely(self, wait: Wait) -> Following<'a> {
+        Following { session: self.session.by(wait), closely: true, ..self }
+    }
+
+    /// Goes on if it cannot follow a topic for lack of memory, descriptors or places, with [`Event::Short`]. Otherwise, the run
+    /// fails.
+    pub fn despite_shortage(self) -> Following<'a> {
+        Following { despite_shortage: true, ..self }
+    }
+
+    /// Says whether `topic` is wanted now. The run does not subscribe to what is not wanted.
+    pub fn want(&mut self, topic: Topic, is_wanted: bool) {
+        self.unwanted.retain(|unwanted| *unwanted != topic);
+        if !is_wanted {
+            self.unwanted.push(topic);
+        }
+    }
+
+    /// Waits for the next event, and returns it; `None` after the last one. At `wake_at` there is a [`Event::Tick`], whatever comes.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::NoTopic`] with the sensors that there are; [`Kind::NoHub`] if the run is bounded and there is none at its start;
+    /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::Short`].
+    pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, End> {
         loop {
-            if !self.closely {
-                self.look(sink)?;
+            if let Some(event) = self.events.pop_front() {
+                return Ok(Some(event));
             }
-            if self.take(stop, sink)? {
-                return Ok(());
+            if let Some(end) = self.end.take() {
+                return end.map(|()| None);
             }
-            if self.closely {
-                self.look(sink)?;
+            if let Err(failure) = self.step(wake_at) {
+                self.end = Some(Err(failure));
             }
-            if sink.wants_lines() {
-                self.watch_lines();
-                self.take_lines(sink)?;
-            }
-            let now = Instant::now();
-            sink.tick(now)?;
-            self.check(sink, now)?;
-            if stop.load(Ordering::Relaxed) {
-                return self.stopped();
-            }
-            if self.bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
-                return self.time_is_over();
-            }
-            self.session.wait(self.wake_at().into_iter().chain(sink.wake_at()).min())?;
         }
     }
 
-    /// News of the hub, and the topics of one that was waited for.
-    fn look(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
+    /// Ends the run, which ended by `end`, with a `summary` of each topic, unless nobody reads it.
+    ///
+    /// # Errors
+    ///
+    /// Those of `summary`, or else `end`.
+    pub fn finish(
+        mut self,
+        end: Result<(), End>,
+        mut summary: impl FnMut(&TopicName, &ReceiveStats) -> Result<(), End>,
+    ) -> Result<(), End> {
+        if !matches!(end, Err(End::ReaderGone)) {
+            self.receive_lines();
+            for topic in &self.topics {
+                let mut stats = topic.stats.clone();
+                stats.loss = self.loss(&topic.name.sensor);
+                summary(&topic.name, &stats)?;
+            }
+        }
+        end
+    }
+
+    fn step(&mut self, wake_at: Option<Instant>) -> Result<(), End> {
+        self.stage = match self.stage {
+            Stage::Start => {
+                self.look()?;
+                Stage::Look
+            }
+            Stage::Look => {
+                if !self.closely {
+                    self.look()?;
+                }
+                self.round = Round::default();
+                Stage::Receive
+            }
+            Stage::Receive if self.round.topic < self.topics.len() => {
+                self.receive()?;
+                Stage::Receive
+            }
+            Stage::Receive => {
+                self.events.push_back(Event::Tick(Instant::now()));
+                Stage::AfterRound
+            }
+            Stage::AfterRound => {
+                let is_stopped = self.stop.load(Ordering::Relaxed);
+                let is_in_time = self.bounds.run_for.is_none_or(|limit| self.started.elapsed() < limit);
+                if self.round.more && !is_stopped && is_in_time {
+                    self.round = Round::default();
+                    Stage::Receive
+                } else {
+                    Stage::Check
+                }
+            }
+            Stage::Check => {
+                self.check()?;
+                Stage::Wait
+            }
+            Stage::Wait => {
+                self.session.wait(self.wake_at().into_iter().chain(wake_at).min())?;
+                Stage::Look
+            }
+        };
+        Ok(())
+    }
+
+    /// Looks for news of the hub, and for the sensors of a new one.
+    fn look(&mut self) -> Result<(), End> {
         let change = self.session.look()?;
         if let Some(who) = change.gone {
             self.discovery.end();
-            self.tell(sink, Notice::HubGone, |name| is_of(name, who))?;
+            self.notice(Notice::HubGone, |name| is_of(name, who));
         }
         if let Some(who) = change.back {
             if self.hub_seen.is_some() || self.waiting_said {
-                self.tell(sink, Notice::HubBack, |name| is_of(name, who))?;
+                self.notice(Notice::HubBack, |name| is_of(name, who));
             }
             self.hub_seen = Some(Instant::now());
-            // What the new one said before anybody looked for it waited for that.
+            // What the new hub sent before this waited for the run, and arrives late.
             let now_ns = clock::now_ns();
-            self.tracks
-                .iter_mut()
-                .filter(|track| track.source.subscribed())
-                .for_each(|track| track.since_ns = now_ns);
+            for topic in self.topics.iter_mut().filter(|topic| topic.source.subscribed()) {
+                topic.since_ns = now_ns;
+            }
             self.discovery.begin(Instant::now());
         }
-        self.discover(sink)
+        self.discover()
     }
 
-    /// Receives what waits; true if that was all that was asked for.
-    fn take(&mut self, stop: &AtomicBool, sink: &mut dyn Sink) -> Result<bool, End> {
-        let mut more = true;
-        while more && !stop.load(Ordering::Relaxed) {
-            more = false;
-            let mut subscribed = false;
-            for track in &mut self.tracks {
-                if !sink.wants(track.name.topic) {
-                    track.let_go();
-                    continue;
-                }
-                // That takes a thousand times as long as receiving: what waits of others comes before the next one.
-                if !track.source.subscribed() && (subscribed || self.shortage.lasts(Instant::now())) {
-                    more |= subscribed;
-                    continue;
-                }
-                for turn in 0..TURN {
-                    let was_subscribed = track.source.subscribed();
-                    let received = match track.source.receive(&mut self.session) {
-                        Err(failure) if failure.kind == Kind::Short => {
-                            sink.short(&track.name, failure)?;
-                            self.shortage.begin(Instant::now());
-                            None
-                        }
-                        received => received?,
-                    };
-                    if received.is_some() {
-                        sink.arrived();
-                    }
-                    if !was_subscribed && track.source.subscribed() {
-                        subscribed = true;
-                        track.since_ns = clock::now_ns();
-                        sink.subscribed(&track.name);
-                    }
-                    let Some(sample) = received else { break };
-                    more |= turn + 1 == TURN;
-                    let now = Instant::now();
-                    if sample.is_silence() {
-                        sink.sample(&track.name, &sample)?;
-                        continue;
-                    }
-                    let missed = sample.missed();
-                    track.stats.count(now, missed, sample.period_us(), sample.is_of_before(track.since_ns));
-                    if missed > 0 {
-                        sink.notice(&[&track.name], Notice::Missed(missed))?;
-                    }
-                    sink.sample(&track.name, &sample)?;
-                    if track.name.is_robot() && sink.wants_lines() {
-                        watch_parts(&mut self.lines, &sample);
-                    }
-                    self.last_sample = now;
-                    self.received += 1;
-                    if self.bounds.count.is_some_and(|count| self.received >= count) {
-                        return Ok(true);
-                    }
+    /// Follows the sensors of the hub that are not followed yet, if the run follows all.
+    fn discover(&mut self) -> Result<(), End> {
+        let Some(domain) = self.session.domain().filter(|_| !self.of_all_sensors.is_empty()) else {
+            return Ok(());
+        };
+        let Some(called) = self.discovery.call(domain, Instant::now())? else { return Ok(()) };
+        for sensor in &called.sensors {
+            for &topic in self.of_all_sensors.iter().filter(|topic| called.may_have(sensor, **topic)) {
+                let name = TopicName { sensor: sensor.clone(), topic };
+                if self.topics.iter().all(|topic| *topic.name != name) {
+                    let name = Rc::new(name);
+                    self.events.push_back(Event::Begun(name.clone()));
+                    self.topics.push(Followed::new(name));
                 }
             }
-            let now = Instant::now();
-            sink.tick(now)?;
-            more &= self.bounds.run_for.is_none_or(|limit| now - self.started < limit);
         }
-        Ok(self.bounds.count == Some(0))
+        Ok(())
     }
 
-    /// Everything that is wrong because nothing comes.
-    fn check(&mut self, sink: &mut dyn Sink, now: Instant) -> Result<(), End> {
+    /// Receives one sample of the topic that has its turn, or ends its turn.
+    fn receive(&mut self) -> Result<(), End> {
+        let is_short = self.is_short();
+        let round = &mut self.round;
+        let topic = &mut self.topics[round.topic];
+        let was_subscribed = topic.source.subscribed();
+        if self.unwanted.contains(&topic.name.topic) {
+            topic.unsubscribe();
+            round.next_topic();
+            return Ok(());
+        }
+        // Subscribing takes a thousand times as long as receiving: samples of other topics come before the next subscription.
+        if !was_subscribed && (round.subscribed || is_short) {
+            round.more |= round.subscribed;
+            round.next_topic();
+            return Ok(());
+        }
+        let received = match topic.source.receive(&mut self.session) {
+            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => {
+                self.short_until = Some(Instant::now() + SHORTAGE_PAUSE);
+                self.events.push_back(Event::Short(topic.name.clone(), failure));
+                None
+            }
+            received => received?,
+        };
+        if !was_subscribed && topic.source.subscribed() {
+            round.subscribed = true;
+            topic.since_ns = clock::now_ns();
+            self.events.push_back(Event::Subscribed(topic.name.clone()));
+        }
+        let Some(sample) = received else {
+            round.next_topic();
+            return Ok(());
+        };
+        let arrival = Arrival { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() };
+        if !sample.is_silence() {
+            let (now, missed) = (Instant::now(), sample.missed());
+            topic.stats.count(now, missed, sample.period_us(), sample.is_of_before(topic.since_ns));
+            if missed > 0 {
+                self.events.push_back(Event::Notice(vec![topic.name.clone()], Notice::Missed(missed)));
+            }
+            if let Some(lines) = self.lines.as_mut().filter(|_| topic.name.is_robot()) {
+                follow_parts(lines, &sample);
+            }
+            self.last_sample = now;
+            self.received += 1;
+            if self.bounds.count.is_some_and(|count| self.received >= count) {
+                self.end = Some(Ok(()));
+            }
+        }
+        self.events.push_back(Event::Sample(topic.name.clone(), sample, arrival));
+        round.taken += 1;
+        if round.taken == TURN {
+            round.more = true;
+            round.next_topic();
+        }
+        Ok(())
+    }
+
+    /// Follows the lines of all sensors that are followed by now, and receives their statuses.
+    fn receive_lines(&mut self) {
+        let Some(lines) = &mut self.lines else { return };
+        for topic in self.topics[self.topics_with_line..].iter().filter(|topic| !topic.name.is_robot()) {
+            follow_line(lines, &topic.name.sensor);
+        }
+        self.topics_with_line = self.topics.len();
+        for FollowedLine { sensor, source, line } in lines {
+            while let Some(follower) = source {
+                match follower.receive(&mut self.session) {
+                    Ok(None) => break,
+                    Ok(Some(status)) => {
+                        line.note(status.header().boot, &status.counters);
+                        self.events.push_back(Event::Line(sensor.clone(), status));
+                    }
+                    Err(_) => *source = None,
+                }
+            }
+        }
+    }
+
+    /// Returns what the line of `sensor` took away in the run.
+    fn loss(&self, sensor: &str) -> Loss {
+        let line = self.lines.iter().flatten().find(|line| line.sensor == sensor);
+        line.map(|line| line.line.loss()).unwrap_or_default()
+    }
+
+    /// Ends the run if it is over, and finds why nothing comes.
+    fn check(&mut self) -> Result<(), End> {
+        if self.bounds.count == Some(0) {
+            self.end = Some(Ok(()));
+            return Ok(());
+        }
+        if self.closely {
+            self.look()?;
+        }
+        self.receive_lines();
+        let now = Instant::now();
         if self.session.domain().is_some() {
-            for track in &mut self.tracks {
-                if track.stats.stale(now) {
-                    sink.notice(&[&track.name], Notice::Stale)?;
+            for topic in &mut self.topics {
+                if topic.stats.stale(now) {
+                    self.events.push_back(Event::Notice(vec![topic.name.clone()], Notice::Stale));
                 }
             }
         }
@@ -330,61 +494,219 @@ impl<'a> Run<'a> {
                 }
                 if !self.waiting_said {
                     self.waiting_said = true;
-                    self.notice(sink, Notice::NoHub(self.session.no_hub()))?;
+                    self.notice(Notice::NoHub(self.session.no_hub()), |_| true);
                 }
             }
-            Some(seen) if now - seen >= GRACE => self.check_sensors(sink)?,
+            Some(seen) if now - seen >= GRACE => self.check_sensors()?,
             _ => {}
         }
-        if self.bounds.timeout.is_some_and(|limit| now - self.last_sample >= limit) {
-            let limit = self.bounds.timeout.unwrap_or_default();
-            let hint =
-                if self.session.domain().is_some() { "`scanhub info` shows why" } else { "there is no hub" };
+        if let Some(limit) = self.bounds.timeout.filter(|limit| now - self.last_sample >= *limit) {
+            let has_hub = self.session.domain().is_some();
+            let hint = if has_hub { "`scanhub info` shows why" } else { "there is no hub" };
             return Err(Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), hint).into());
+        }
+        if self.stop.load(Ordering::Relaxed) {
+            if self.bounds.bounded() {
+                return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
+            }
+            self.end = Some(Ok(()));
+        } else if self.bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
+            if let Some(count) = self.bounds.count {
+                let what = format!("{} of {count} samples arrived in time", self.received);
+                return Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into());
+            }
+            self.end = Some(Ok(()));
         }
         Ok(())
     }
 
-    /// News of the hub concern every stream.
-    fn notice(&self, sink: &mut dyn Sink, notice: Notice) -> Result<(), End> {
-        self.tell(sink, notice, |_| true)
+    /// Fails if the run follows a sensor that the hub does not have: a hub that is up has all its topics.
+    fn check_sensors(&mut self) -> Result<(), End> {
+        // What nobody wants now is not missing: asking costs more than following.
+        let (unwanted, topics) = (&self.unwanted, &self.topics);
+        let is_missing =
+            |topic: &Followed| !unwanted.contains(&topic.name.topic) && !topic.source.subscribed();
+        if !topics.is_empty() && !topics.iter().any(is_missing) {
+            return Ok(());
+        }
+        // A process without a descriptor to follow a topic has none to ask for it.
+        if self.session.domain().is_none() || self.is_short() {
+            return Ok(());
+        }
+        if self.asked_at.is_some_and(|at| at.elapsed() < ASK_EVERY) {
+            return Ok(());
+        }
+        self.asked_at = Some(Instant::now());
+        // On a busy machine, a hub may take seconds to create its topics.
+        if self.session.hub_is_starting() {
+            return Ok(());
+        }
+        // A hub that starts beside a listener creates its topics first.
+        let lives = self.session.hub_lives();
+        self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
+        let published = self.session.domain().map(scanhub_shm::published).transpose()?.unwrap_or_default();
+        let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
+        sensors.dedup();
+        let wants_all = topics.iter().all(|topic| topic.name.is_robot());
+        // Those of the hub, or without a hub those of other machines.
+        let may_come = self.may_come(if lives { Who::Hub } else { Who::Listener });
+        if wants_all && !may_come && sensors.iter().all(|sensor| is_remote(sensor) == lives) {
+            let (what, hint) = match lives {
+                true => ("the hub has no sensors", "scanhub run --link NAME=PORT"),
+                false => {
+                    ("no sensor of another machine is published here", "`scanhub listen` shows who sends")
+                }
+            };
+            return Err(Failure::new(Kind::NoTopic, what, hint).into());
+        }
+        for topic in topics {
+            let sensor = &topic.name.sensor;
+            let is_there =
+                topic.name.is_robot() || sensors.contains(sensor) || self.may_come(publisher(sensor));
+            if is_missing(topic) && !is_there {
+                return Err(no_sensor(sensor, &sensors).into());
+            }
+            let of_sensor: Vec<Topic> =
+                published.iter().filter(|(of, _)| of == sensor).map(|(_, topic)| *topic).collect();
+            let maker = topic.name.topic.maker();
+            if !of_sensor.is_empty() && of_sensor.iter().all(|other| other.maker() != maker) {
+                return Err(no_such_topic(&topic.name, &of_sensor).into());
+            }
+        }
+        Ok(())
     }
 
-    /// As [`notice`](Self::notice), to those streams alone that it concerns.
-    fn tell(
-        &self,
-        sink: &mut dyn Sink,
-        notice: Notice,
-        concerns: impl Fn(&TopicName) -> bool,
-    ) -> Result<(), End> {
+    /// Returns whether `who` may still start: another machine later, or the hub beside a listener.
+    fn may_come(&self, who: Who) -> bool {
+        let unbounded = !self.bounds.bounded();
+        match who {
+            Who::Listener => unbounded || self.started.elapsed() < ANNOUNCED,
+            Who::Hub => unbounded && self.hub_lives_since.is_none_or(|since| since.elapsed() < GRACE),
+        }
+    }
+
+    /// Tells `notice` of the topics that it `concerns`.
+    fn notice(&mut self, notice: Notice, concerns: impl Fn(&TopicName) -> bool) {
         let names: Vec<_> =
-            self.tracks.iter().map(|track| &track.name).filter(|name| concerns(name)).collect();
-        if names.is_empty() && !self.tracks.is_empty() { Ok(()) } else { sink.notice(&names, notice) }
+            self.topics.iter().map(|topic| &topic.name).filter(|name| concerns(name)).cloned().collect();
+        if !names.is_empty() || self.topics.is_empty() {
+            self.events.push_back(Event::Notice(names, notice));
+        }
+    }
+
+    fn is_short(&self) -> bool {
+        self.short_until.is_some_and(|until| Instant::now() < until)
     }
 
     fn wake_at(&self) -> Option<Instant> {
         let end = self.bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = self.bounds.timeout.and_then(|limit| self.last_sample.checked_add(limit));
-        let left = self.tracks.iter().filter_map(|track| track.source.left()).min();
+        let left = self.topics.iter().filter_map(|topic| topic.source.left()).min();
         let left = left.into_iter().chain(self.discovery.left()).min();
         let unheard = left.and_then(|left| Instant::now().checked_add(left));
         [end, silence, unheard].into_iter().flatten().min()
     }
+}
 
-    fn stopped(&self) -> Result<(), End> {
-        if self.bounds.bounded() {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
+impl Followed {
+    fn new(name: Rc<TopicName>) -> Followed {
+        Followed {
+            source: Source::new(&name.sensor, name.topic),
+            stats: ReceiveStats::new(name.topic),
+            name,
+            since_ns: u64::MAX,
         }
+    }
+
+    /// Is no subscriber any more, until the topic is wanted again.
+    fn unsubscribe(&mut self) {
+        if self.source.subscribed() {
+            *self = Followed::new(self.name.clone());
+        }
+    }
+}
+
+/// Follows the lines of the sensors of a verdict over several.
+fn follow_parts(lines: &mut Vec<FollowedLine>, sample: &Sample) {
+    if let Sample::Robot(heard) = sample
+        && heard.robot.sensors().count() != lines.len()
+    {
+        heard.robot.sensors().for_each(|(sensor, _)| follow_line(lines, sensor));
+    }
+}
+
+fn follow_line(lines: &mut Vec<FollowedLine>, sensor: &str) {
+    if lines.iter().all(|line| line.sensor != sensor) {
+        let source = Some(Follower::new(sensor));
+        lines.push(FollowedLine { sensor: sensor.to_owned(), source, line: Line::default() });
+    }
+}
+
+/// Returns who publishes the sensor that is called so.
+fn publisher(sensor: &str) -> Who {
+    if is_remote(sensor) { Who::Listener } else { Who::Hub }
+}
+
+/// Returns whether `who` publishes `name`. The sensors of a robot may come from any publisher.
+fn is_of(name: &TopicName, who: Who) -> bool {
+    name.is_robot() || publisher(&name.sensor) == who
+}
+
+/// What a verb does with what it follows.
+pub trait Sink {
+    /// A topic will be followed.
+    fn begin(&mut self, _name: &TopicName) {}
+    /// The topic is there, and what is sent from now on will be received.
+    fn subscribed(&mut self, _name: &TopicName) {}
+    /// A sample came, or one that stands for a silence and does not count.
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
+    /// Something went wrong, or right again, in the streams of `names`.
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End>;
+    /// Comes about ten times a second and after every round of samples.
+    fn tick(&mut self, _now: Instant) -> Result<(), End> {
         Ok(())
     }
-
-    fn time_is_over(&self) -> Result<(), End> {
-        match self.bounds.count {
-            Some(count) => {
-                let what = format!("{} of {count} samples arrived in time", self.received);
-                Err(Failure::new(Kind::Timeout, what, "`scanhub info` shows why").into())
-            }
-            None => Ok(()),
-        }
+    /// When [`tick`](Self::tick) has something to do before that.
+    fn wake_at(&self) -> Option<Instant> {
+        None
     }
+    /// Whether `topic` is wanted now.
+    fn wants(&self, _topic: Topic) -> bool {
+        true
+    }
+    /// Memory, descriptors or places are too short to follow `name`.
+    fn short(&mut self, _name: &TopicName, failure: Failure) -> Result<(), End> {
+        Err(failure.into())
+    }
+    /// The run is over.
+    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End>;
+}
+
+/// Follows topics for `sink`.
+pub fn follow(
+    names: &[TopicName],
+    topics: &[Topic],
+    places: &[Domain],
+    bounds: &Bounds,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), End> {
+    let mut following = Following::new(names, topics, places, bounds, stop).despite_shortage();
+    let mut run = || {
+        loop {
+            Topic::ALL.into_iter().for_each(|topic| following.want(topic, sink.wants(topic)));
+            match following.next(sink.wake_at())? {
+                None => return Ok(()),
+                Some(Event::Begun(name)) => sink.begin(&name),
+                Some(Event::Subscribed(name)) => sink.subscribed(&name),
+                Some(Event::Sample(name, sample, _)) => sink.sample(&name, &sample)?,
+                Some(Event::Notice(names, notice)) => sink.notice(&names, notice)?,
+                Some(Event::Short(name, failure)) => sink.short(&name, failure)?,
+                Some(Event::Tick(now)) => sink.tick(now)?,
+                Some(Event::Line(..)) => {}
+            }
+        }
+    };
+    let end = run();
+    following.finish(end, |name, stats| sink.summary(name, stats))
 }

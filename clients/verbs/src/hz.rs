@@ -2,16 +2,16 @@
 
 use std::collections::VecDeque;
 use std::io::Write;
+use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
-use scanhub_client::streams::Sample;
 use scanhub_schema::{Failure, Status, Topic};
 use scanhub_shm::Domain;
 use serde::Serialize;
 
-use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
@@ -53,7 +53,9 @@ pub fn hz(
         out: Output::new(out),
         notes: Output::new(notes),
     };
-    quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut hz))
+    let mut following = Following::new(&named, &of_all, &options.places, &options.bounds, stop).with_lines();
+    let end = hz.run(&mut following);
+    quiet(following.finish(end, |name, stats| hz.summary(name, stats)))
 }
 
 const EVERY: Duration = Duration::from_secs(1);
@@ -71,51 +73,53 @@ struct Hz<'a> {
 /// A topic, and since when of CLOCK_MONOTONIC its samples are received as they are sent, in ns: what it keeps for late
 /// joiners comes before that, and at no rate.
 struct Followed {
-    name: TopicName,
+    name: Rc<TopicName>,
     since_ns: u64,
     window: Window,
 }
 
-impl Sink for Hz<'_> {
-    fn begin(&mut self, name: &TopicName) {
-        let window = Window::new(self.length);
-        self.windows.push(Followed { name: name.clone(), since_ns: u64::MAX, window });
-    }
-
-    fn subscribed(&mut self, name: &TopicName) {
-        let now_ns = clock::now_ns();
-        self.windows.iter_mut().filter(|it| it.name == *name).for_each(|it| it.since_ns = now_ns);
-    }
-
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if !sample.is_silence()
-            && let Some(followed) = self.windows.iter_mut().find(|followed| followed.name == *name)
-            && !sample.is_of_before(followed.since_ns)
-        {
-            followed.window.arrived(Instant::now(), sample.missed());
+impl Hz<'_> {
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Begun(name) => {
+                    let window = Window::new(self.length);
+                    self.windows.push(Followed { name, since_ns: u64::MAX, window });
+                }
+                Event::Subscribed(name) => self.begin(&name),
+                Event::Sample(name, sample, _) if !sample.is_silence() => {
+                    let followed = self.windows.iter_mut().find(|followed| followed.name == name);
+                    if let Some(followed) = followed.filter(|it| !sample.is_of_before(it.since_ns)) {
+                        followed.window.arrived(Instant::now(), sample.missed());
+                    }
+                }
+                Event::Notice(names, notice) => {
+                    if notice == Notice::HubBack {
+                        names.iter().for_each(|name| self.begin(name));
+                    }
+                    notice.tell(&names, self.json, &mut self.out, &mut self.notes)?;
+                }
+                Event::Line(sensor, status) => self.line(&sensor, &status),
+                Event::Tick(now) => self.tick(now)?,
+                Event::Sample(..) | Event::Short(..) => {}
+            }
         }
         Ok(())
     }
 
-    fn wants_lines(&self) -> bool {
-        true
+    /// Takes samples of `name` into account from now on.
+    fn begin(&mut self, name: &TopicName) {
+        let now_ns = clock::now_ns();
+        self.windows.iter_mut().filter(|it| *it.name == *name).for_each(|it| it.since_ns = now_ns);
     }
 
-    fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
+    fn line(&mut self, sensor: &str, status: &Status) {
         if self.lines.iter().all(|line| line.sensor != sensor) {
             self.lines.push(LineWindow::new(sensor));
         }
         if let Some(line) = self.lines.iter_mut().find(|line| line.sensor == sensor) {
             line.note(Instant::now(), status, self.length);
         }
-        Ok(())
-    }
-
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        if notice == Notice::HubBack {
-            names.iter().for_each(|name| self.subscribed(name));
-        }
-        notice.tell(names, self.json, &mut self.out, &mut self.notes)
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

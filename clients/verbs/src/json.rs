@@ -10,6 +10,7 @@ use scanhub_schema::{
 };
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
+use std::rc::Rc;
 
 use crate::follow::Notice;
 use crate::names::TopicName;
@@ -252,7 +253,7 @@ pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
 }
 
 /// Class `notice`: a line for each of `names`, or one without a name.
-pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: &Notice) -> Result<(), End> {
+pub(crate) fn notices(output: &mut Output<'_>, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), End> {
     #[derive(Serialize)]
     struct Line<'a> {
         class: &'static str,

@@ -17,14 +17,14 @@ use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Flags, Kind};
 use scanhub_shm::Domain;
 
-use crate::follow::{Bounds, Notice, Sink, follow_closely};
+use crate::follow::{Arrival, Bounds, Event, Following, Notice};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use realtime::Realtime;
 use report::{Conditions, NOTHING_CAME, why_nothing};
-use spans::{Seen, Span, Spans};
+use spans::{Span, Spans};
 
 /// What `latency` is asked for.
 #[derive(Clone, Debug)]
@@ -68,7 +68,6 @@ pub fn latency(
         json: options.json,
         terminal: options.terminal,
         topics: names.iter().map(|name| (name.clone(), Spans::new())).collect(),
-        seen: Seen::default(),
         next: Instant::now() + EVERY,
         out: Output::new(out),
         notes: Output::new(notes),
@@ -77,8 +76,12 @@ pub fn latency(
     let realtime =
         if options.realtime { Realtime::take(options.wait, processors) } else { Realtime::default() };
     let conditions = Conditions::new(options.wait, &realtime, grain::grain());
-    let end = latency.tell(&conditions).and_then(|()| {
-        follow_closely(options.wait, &names, &options.places, &options.bounds, stop, &mut latency)
+    let told = latency.tell(&conditions);
+    let following = Following::new(&names, &[], &options.places, &options.bounds, stop);
+    let mut following = following.closely(options.wait);
+    let end = told.and_then(|()| {
+        let end = latency.run(&mut following);
+        following.finish(end, |name, stats| latency.summary(name, stats))
     });
     quiet(end.and_then(|()| options.max_p99.map_or(Ok(()), |limit| Ok(latency.judge(limit)?))))
 }
@@ -89,8 +92,6 @@ struct Latency<'a> {
     json: bool,
     terminal: bool,
     topics: Vec<(TopicName, Spans)>,
-    /// When the sample was received that is looked at.
-    seen: Seen,
     next: Instant,
     out: Output<'a>,
     notes: Output<'a>,
@@ -125,36 +126,39 @@ impl Latency<'_> {
         }
         Ok(())
     }
-}
 
-impl Sink for Latency<'_> {
-    fn subscribed(&mut self, name: &TopicName) {
-        let now_ns = clock::now_ns();
-        if let Some((_, spans)) = self.topics.iter_mut().find(|(known, _)| known == name) {
-            spans.begin(now_ns);
-        }
-    }
-
-    fn arrived(&mut self) {
-        self.seen = Seen { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() };
-    }
-
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if let Some(header) = sample.header()
-            && let Some((_, spans)) = self.topics.iter_mut().find(|(known, _)| known == name)
-        {
-            spans.take(header, self.seen);
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Subscribed(name) => {
+                    if let Some(spans) = self.spans(&name) {
+                        spans.begin(clock::now_ns());
+                    }
+                }
+                Event::Sample(name, sample, arrival) => self.sample(&name, &sample, arrival),
+                Event::Notice(names, notice) => {
+                    if notice == Notice::HubBack {
+                        // What the new hub sent before this waited for the verb.
+                        let now_ns = clock::now_ns();
+                        self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
+                    }
+                    notice.tell(&names, self.json, &mut self.out, &mut self.notes)?;
+                }
+                Event::Tick(now) => self.tick(now)?,
+                Event::Begun(_) | Event::Short(..) | Event::Line(..) => {}
+            }
         }
         Ok(())
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        if notice == Notice::HubBack {
-            // What the new one said before anybody looked for it waited for that.
-            let now_ns = clock::now_ns();
-            self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
+    fn spans(&mut self, name: &TopicName) -> Option<&mut Spans> {
+        self.topics.iter_mut().find(|(known, _)| known == name).map(|(_, spans)| spans)
+    }
+
+    fn sample(&mut self, name: &TopicName, sample: &Sample, arrival: Arrival) {
+        if let (Some(header), Some(spans)) = (sample.header(), self.spans(name)) {
+            spans.take(header, arrival);
         }
-        notice.tell(names, self.json, &mut self.out, &mut self.notes)
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

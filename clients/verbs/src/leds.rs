@@ -8,6 +8,7 @@ mod lamps;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -17,10 +18,9 @@ use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followe
 use scanhub_shm::Domain;
 use serde::Serialize;
 
-use crate::follow::{Bounds, Notice, Sink, follow, follow_with_early};
+use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
-use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 use device::{Device, News};
 use hold::Hold;
@@ -93,10 +93,11 @@ pub fn leds(
     };
     let began = board.take(&options.led_root, &wanted).and_then(|()| board.show(Lamps::UNKNOWN, true));
     let LedsOptions { places, bounds, .. } = options;
-    let end = began.and_then(|()| match options.early {
-        true => follow_with_early(&names, places, bounds, stop, &mut board),
-        false => follow(&names, &[], places, bounds, stop, &mut board),
-    });
+    let mut following = Following::new(&names, &[], places, bounds, stop).with_lines();
+    if options.early {
+        following = following.with_early();
+    }
+    let end = began.and_then(|()| board.run(&mut following));
     quiet(end.and(board.leave()))
 }
 
@@ -243,8 +244,21 @@ impl Board<'_> {
     }
 }
 
-impl Sink for Board<'_> {
-    fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
+impl Board<'_> {
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(self.verdict.changes_at())? {
+            match event {
+                Event::Sample(_, sample, _) => self.sample(&sample)?,
+                Event::Notice(names, notice) => self.notice(&names, notice)?,
+                Event::Line(sensor, status) => self.line(&sensor, &status)?,
+                Event::Tick(now) => self.tick(now)?,
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn sample(&mut self, sample: &Sample) -> Result<(), End> {
         let now = Instant::now();
         let mut marks = self.lamps.marks;
         match sample {
@@ -263,10 +277,6 @@ impl Sink for Board<'_> {
         self.show_known(marks, now)
     }
 
-    fn wants_lines(&self) -> bool {
-        true
-    }
-
     /// Reported when a line starts or stops losing data; the changing amount is not.
     fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
@@ -281,7 +291,7 @@ impl Sink for Board<'_> {
         if is_news { self.draw() } else { Ok(()) }
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         // Not worth a word: what counts is what stands now.
         if matches!(notice, Notice::Missed(_)) {
             return Ok(());
@@ -302,14 +312,6 @@ impl Sink for Board<'_> {
         let marks = if self.marks.silence(clock::now()) { None } else { self.lamps.marks };
         self.show_known(marks, now)?;
         self.switch(now)
-    }
-
-    fn wake_at(&self) -> Option<Instant> {
-        self.verdict.changes_at()
-    }
-
-    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
-        Ok(())
     }
 }
 

@@ -3,6 +3,7 @@
 
 use std::fmt::Write as _;
 use std::io::Write;
+use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -12,10 +13,9 @@ use scanhub_shm::Domain;
 use serde::Serialize;
 
 use crate::body::{Body, Mask, SLICES, Sector};
-use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
-use crate::receive_stats::ReceiveStats;
 use crate::text;
 
 /// What `mask` is asked for.
@@ -73,7 +73,7 @@ pub fn mask(
         progress,
         told: 0,
     };
-    quiet(follow(&names, &[], &options.places, &bounds, stop, &mut look))?;
+    quiet(look.run(&mut Following::new(&names, &[], &options.places, &bounds, stop)))?;
     let (body, within_mm) = look.seen(sensor)?;
     let (scans, mask) = (body.scans(), body.mask());
     let is_violated = look.is_violated();
@@ -137,9 +137,19 @@ impl Look<'_> {
         let share = self.since.elapsed().as_secs_f64() / self.run_for.as_secs_f64();
         ((share * SLICES as f64) as usize).min(SLICES - 1)
     }
-}
 
-impl Sink for Look<'_> {
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
+                Event::Notice(names, notice) => self.notice(&names, notice)?,
+                Event::Tick(now) => self.tick(now),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         match sample {
             Sample::Status(status) => self.pose = Some(status.pose),
@@ -165,7 +175,7 @@ impl Sink for Look<'_> {
         Ok(())
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if notice == Notice::HubGone {
             return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
         }
@@ -173,7 +183,7 @@ impl Sink for Look<'_> {
         self.notes.line(|line| text::notice(line, names, &notice))
     }
 
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
+    fn tick(&mut self, now: Instant) {
         let seconds = (now - self.since).as_secs();
         if seconds >= self.told {
             self.told = seconds + 1;
@@ -181,11 +191,6 @@ impl Sink for Look<'_> {
             let done = format!("{seconds} of {} s, {scans} scans", self.run_for.as_secs_f64());
             (self.progress)(Some(&done));
         }
-        Ok(())
-    }
-
-    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
-        Ok(())
     }
 }
 

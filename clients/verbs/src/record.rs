@@ -29,7 +29,7 @@ use scanhub_schema::file::Compression;
 use scanhub_schema::{Failure, Header, Kind};
 use scanhub_shm::Domain;
 
-use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::follow::{Bounds, Event, Following};
 use crate::lossy_writer::LossyWriter;
 use crate::names::TopicName;
 use crate::output::{End, quiet};
@@ -130,8 +130,11 @@ pub fn record(
     let writing = writing
         .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
     let (names, topics) = (selection.names(), selection.topics());
-    let end =
-        begun.and_then(|()| follow(&names, &topics, &options.places, &options.bounds, stop, &mut recorder));
+    let mut following = Following::new(&names, &topics, &options.places, &options.bounds, stop).with_lines();
+    let end = begun.and_then(|()| {
+        let end = recorder.run(&mut following);
+        following.finish(end, |name, stats| recorder.summary(name, stats))
+    });
     // If the hub or the reader of these lines went away, the recording is kept.
     let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
     let finished = recorder.finish(writing, stays, stop);
@@ -280,12 +283,24 @@ impl Recorder<'_> {
         told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
         if stays { self.report.end(&stats, self.left_out) } else { Ok(()) }
     }
-}
 
-impl Sink for Recorder<'_> {
-    fn begin(&mut self, name: &TopicName) {
-        self.queue.note(Entry::Track(name.clone()));
-        self.tracks.push(name.clone());
+    fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Begun(name) => {
+                    self.queue.note(Entry::Track(TopicName::clone(&name)));
+                    self.tracks.push(TopicName::clone(&name));
+                }
+                Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
+                Event::Notice(names, notice) => self.report.hub(&names, notice)?,
+                Event::Tick(now) if now >= self.tick_at => {
+                    self.tick_at = now + LOOK_EVERY;
+                    self.look()?;
+                }
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
@@ -302,22 +317,6 @@ impl Sink for Recorder<'_> {
         }
         self.pushed += 1;
         Ok(())
-    }
-
-    fn wants_lines(&self) -> bool {
-        true
-    }
-
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        self.report.hub(names, notice)
-    }
-
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
-        if now < self.tick_at {
-            return Ok(());
-        }
-        self.tick_at = now + LOOK_EVERY;
-        self.look()
     }
 
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {

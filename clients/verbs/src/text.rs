@@ -7,6 +7,7 @@ mod tilted;
 use std::f64::consts::TAU;
 use std::fmt;
 use std::io::{self, Write};
+use std::rc::Rc;
 
 use scanhub_client::streams::Sample;
 use scanhub_schema::{Failure, Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
@@ -36,7 +37,7 @@ pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> i
 }
 
 /// One notice, for stderr; news of the hub are the same for all streams.
-pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: &Notice) -> io::Result<()> {
+pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notice) -> io::Result<()> {
     match notice {
         Notice::NoHub(Failure { message, hint, .. }) => {
             return write!(line, "{message}, waiting for one: {hint}");

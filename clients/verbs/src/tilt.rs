@@ -6,6 +6,7 @@ mod lines;
 mod publish;
 
 use std::io::Write;
+use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -161,7 +162,7 @@ impl Sink for Verb<'_> {
         std::mem::replace(&mut teller.told, Ok(()))
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if let Notice::Missed(count) = notice {
             self.missed += count;
         }

@@ -5,6 +5,7 @@ mod lines;
 mod publish;
 
 use std::io::Write;
+use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -187,7 +188,7 @@ impl Sink for Verb<'_> {
         told
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if let Notice::Missed(count) = notice {
             self.missed += count;
         }

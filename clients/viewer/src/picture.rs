@@ -6,6 +6,7 @@ use scanhub_client::streams::Sample;
 use scanhub_client::{clock, live_topics};
 use scanhub_schema::{Maker, Topic};
 use scanhub_shm::Domain;
+use std::rc::Rc;
 
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::TopicName;
@@ -74,7 +75,7 @@ pub(crate) fn take(scene: &mut Scene, name: &TopicName, sample: &Sample) {
 }
 
 /// Takes note of what went wrong in the streams of `names`.
-pub(crate) fn note(scene: &mut Scene, names: &[&TopicName], notice: &Notice) {
+pub(crate) fn note(scene: &mut Scene, names: &[Rc<TopicName>], notice: &Notice) {
     match (notice, names) {
         (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
             scene.sensor(&name.sensor).lost += *missed;

@@ -14,6 +14,7 @@ mod screen;
 mod view;
 
 use std::io::Write;
+use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -167,7 +168,7 @@ impl Sink for Watcher<'_> {
         Ok(())
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         picture::note(&mut self.scene, names, &notice);
         self.changed = true;
         if let Notice::NoHub(Failure { message, hint, .. }) = notice {

@@ -201,7 +201,7 @@ mod tests {
     use scanhub_schema::Header;
 
     use super::*;
-    use crate::latency::spans::Seen;
+    use crate::follow::Arrival;
 
     fn measured() -> (TopicName, Spans) {
         let mut spans = Spans::new();
@@ -212,7 +212,7 @@ mod tests {
             let mut header =
                 Header { stamp_first_ns: 400_000, stamp_last_ns: last_ns, flags: 2, ..Header::default() };
             header.set_sent_at(last_ns + 512);
-            spans.take(&header, Seen { monotonic_ns: last_ns + age_ns, wall_ns: 0 });
+            spans.take(&header, Arrival { monotonic_ns: last_ns + age_ns, wall_ns: 0 });
         }
         (TopicName::parse("front/scan").expect("a topic"), spans)
     }

@@ -4,6 +4,7 @@
 use scanhub_schema::{Flags, Header};
 
 use super::ages::Ages;
+use crate::follow::Arrival;
 
 /// A stretch of a sample's way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,15 +41,6 @@ impl Span {
     }
 }
 
-/// When a sample was received, in ns.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Seen {
-    /// CLOCK_MONOTONIC.
-    pub(super) monotonic_ns: u64,
-    /// The wall clock.
-    pub(super) wall_ns: u64,
-}
-
 /// The ages of one topic's samples.
 pub(super) struct Spans {
     /// Since when samples are received as they are sent.
@@ -83,7 +75,7 @@ impl Spans {
     }
 
     /// A sample with `header` was received.
-    pub(super) fn take(&mut self, header: &Header, seen: Seen) {
+    pub(super) fn take(&mut self, header: &Header, seen: Arrival) {
         self.received += 1;
         self.flags |= header.flags;
         if header.stamp_last_ns < self.since_ns {
@@ -148,8 +140,8 @@ mod tests {
     }
 
     /// So long after `header`'s last byte.
-    fn seen(header: &Header, age_ns: u64) -> Seen {
-        Seen { monotonic_ns: header.stamp_last_ns + age_ns, wall_ns: 0 }
+    fn seen(header: &Header, age_ns: u64) -> Arrival {
+        Arrival { monotonic_ns: header.stamp_last_ns + age_ns, wall_ns: 0 }
     }
 
     fn begun() -> Spans {
@@ -214,7 +206,7 @@ mod tests {
     fn no_age_is_negative() {
         let mut spans = begun();
         let header = header(2_000_000 * US);
-        spans.take(&header, Seen { monotonic_ns: header.stamp_last_ns - 1, wall_ns: 0 });
+        spans.take(&header, Arrival { monotonic_ns: header.stamp_last_ns - 1, wall_ns: 0 });
         assert_eq!((spans.ahead, told(&spans).len()), (1, 0));
         spans.take(&header, seen(&header, 10));
         let parts = told(&spans);
@@ -231,7 +223,7 @@ mod tests {
             flags: Flags::REMOTE,
             ..Header::default()
         };
-        let seen = Seen { monotonic_ns: arrival + 50 * US, wall_ns: 9_000_050 * US };
+        let seen = Arrival { monotonic_ns: arrival + 50 * US, wall_ns: 9_000_050 * US };
         let mut spans = begun();
         spans.take(&remote(8_999_000 * US), seen);
         let parts = told(&spans);

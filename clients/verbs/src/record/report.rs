@@ -4,6 +4,7 @@
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -81,7 +82,7 @@ impl<'a> Report<'a> {
     }
 
     /// News of the hub, and of what was not received.
-    pub(super) fn hub(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if let Notice::Missed(missed) = notice {
             self.lost += missed;
         }

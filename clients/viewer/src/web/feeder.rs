@@ -1,5 +1,6 @@
 //! What follows the hub: samples become a scene, and the scene what is put up on the board. Refuses to know who looks at it.
 
+use std::rc::Rc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
@@ -305,7 +306,7 @@ impl Sink for Feeder<'_> {
         Ok(())
     }
 
-    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         picture::note(&mut self.scene, names, &notice);
         if let Notice::NoHub(failure) = &notice
             && !self.options.json
