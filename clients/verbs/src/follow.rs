@@ -226,7 +226,7 @@ impl<'a> Following<'a> {
         }
     }
 
-    /// Follows the statuses of the sensors, too: for what their lines take away.
+    /// Follows the statuses of the sensors, too. They count the losses on the serial lines.
     pub fn with_lines(self) -> Following<'a> {
         Following { lines: Some(Vec::new()), ..self }
     }
@@ -250,7 +250,7 @@ impl<'a> Following<'a> {
         Following { despite_shortage: true, ..self }
     }
 
-    /// Says whether `topic` is wanted now. The run does not subscribe to what is not wanted.
+    /// Subscribes to `topic` again, or ends its subscriptions until it is wanted again.
     pub fn want(&mut self, topic: Topic, is_wanted: bool) {
         self.unwanted.retain(|unwanted| *unwanted != topic);
         if !is_wanted {
@@ -262,7 +262,7 @@ impl<'a> Following<'a> {
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] with the sensors that there are; [`Kind::NoHub`] if the run is bounded and there is none at its start;
+    /// [`Kind::NoTopic`] with the names of the sensors; [`Kind::NoHub`] if the run is bounded and no hub lives at its start;
     /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::Short`].
     pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, End> {
         loop {
@@ -278,7 +278,8 @@ impl<'a> Following<'a> {
         }
     }
 
-    /// Ends the run, which ended by `end`, with a `summary` of each topic, unless nobody reads it.
+    /// Writes a `summary` of each topic at the end of the run, unless the reader of the output has closed it. `end` is the result
+    /// of the run.
     ///
     /// # Errors
     ///
@@ -354,7 +355,7 @@ impl<'a> Following<'a> {
                 self.notice(Notice::HubBack, |name| is_of(name, who));
             }
             self.hub_seen = Some(Instant::now());
-            // What the new hub sent before this waited for the run, and arrives late.
+            // Samples that the new hub sent before this moment waited for the run, and arrive late.
             let now_ns = clock::now_ns();
             for topic in self.topics.iter_mut().filter(|topic| topic.source.subscribed()) {
                 topic.since_ns = now_ns;
@@ -469,7 +470,7 @@ impl<'a> Following<'a> {
         line.map(|line| line.line.loss()).unwrap_or_default()
     }
 
-    /// Ends the run if it is over, and finds why nothing comes.
+    /// Ends the run at its bounds, and finds the reason for a silence.
     fn check(&mut self) -> Result<(), End> {
         if self.bounds.count == Some(0) {
             self.end = Some(Ok(()));
@@ -522,7 +523,7 @@ impl<'a> Following<'a> {
 
     /// Fails if the run follows a sensor that the hub does not have: a hub that is up has all its topics.
     fn check_sensors(&mut self) -> Result<(), End> {
-        // What nobody wants now is not missing: asking costs more than following.
+        // A topic that is not wanted now is not missing: asking costs more than following.
         let (unwanted, topics) = (&self.unwanted, &self.topics);
         let is_missing =
             |topic: &Followed| !unwanted.contains(&topic.name.topic) && !topic.source.subscribed();
@@ -541,7 +542,7 @@ impl<'a> Following<'a> {
         if self.session.hub_is_starting() {
             return Ok(());
         }
-        // A hub that starts beside a listener creates its topics first.
+        // A hub that starts after a listener creates its topics first.
         let lives = self.session.hub_lives();
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
         let published = self.session.domain().map(scanhub_shm::published).transpose()?.unwrap_or_default();
@@ -576,7 +577,7 @@ impl<'a> Following<'a> {
         Ok(())
     }
 
-    /// Returns whether `who` may still start: another machine later, or the hub beside a listener.
+    /// Returns whether `who` may still start: another machine at any time, or the hub after a listener.
     fn may_come(&self, who: Who) -> bool {
         let unbounded = !self.bounds.bounded();
         match who {
@@ -618,7 +619,7 @@ impl Followed {
         }
     }
 
-    /// Is no subscriber any more, until the topic is wanted again.
+    /// Ends the subscription.
     fn unsubscribe(&mut self) {
         if self.source.subscribed() {
             *self = Followed::new(self.name.clone());

@@ -138,7 +138,7 @@ impl Latency<'_> {
                 Event::Sample(name, sample, arrival) => self.sample(&name, &sample, arrival),
                 Event::Notice(names, notice) => {
                     if notice == Notice::HubBack {
-                        // What the new hub sent before this waited for the verb.
+                        // Samples that the new hub sent before this moment waited for the verb.
                         let now_ns = clock::now_ns();
                         self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
                     }
