@@ -1,12 +1,12 @@
-//! The whole hub in one thread and in made-up time: simulated sensors, lines with faults, ttys, the hub's own core, topics in
-//! memory, consumers; behind them a gateway, a network, a listener and a robot on another machine. A seed says what goes wrong and when; judges watch everything that happens; a failure is a number that
-//! can be played again, and shrinks to the few actions that matter.
+//! The whole hub in one thread and in virtual time: simulated scanners, lines with faults, ttys, the hub's core, topics in
+//! memory, and subscribers. A gateway, a network, a listener and a robot on another machine follow them. A seed draws the faults
+//! and their times, and judges check every event. A failure is a seed that can be repeated, and shrinks to the few actions that
+//! matter.
 //!
-//! [`Plan`] is what shall happen, as data; [`run`] lets it happen; [`Outcome`] is what the judges say.
+//! [`Plan`] is the course of a world as data, [`run`] runs it, and [`Outcome`] is the result of the judges.
 
 mod actions;
 mod consumer;
-pub mod corpus;
 mod event;
 mod family;
 mod hash;
@@ -21,14 +21,13 @@ mod runner;
 mod sensor;
 mod setup;
 mod shared;
-pub mod shrink;
 mod sim_platform;
 mod topics;
 mod tty;
 mod world;
 
 pub use event::{Detail, Figures, Violation};
-pub use plan::{Action, Plan};
+pub use plan::{Action, Plan, corpus, shrink};
 pub use planted::Defect;
 pub use runner::{Runner, Totals};
 pub use world::{Outcome, is_found, run};

@@ -107,7 +107,7 @@ fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
         return Ok(vec![text.parse()?]);
     }
     if arguments.corpus {
-        return Ok(corpus::corpus().into_iter().map(|(_, plan)| plan).collect());
+        return Ok(corpus().into_iter().map(|(_, plan)| plan).collect());
     }
     Ok(match arguments.seed {
         Some(seed) => vec![of_seed(seed)],
@@ -123,7 +123,7 @@ fn report(plan: &Plan, outcome: &Outcome, is_same: bool, is_long: bool) {
     }
     outcome.violations.iter().take(5).for_each(|violation| println!("  {violation}"));
     let judge = |plan: &Plan| run(plan, Detail::Nothing).violations.first().map(|violation| violation.judge);
-    let shortest = if is_long { plan.clone() } else { shrink::shrink(plan, judge) };
+    let shortest = if is_long { plan.clone() } else { shrink(plan, judge) };
     println!("{shortest}");
 }
 

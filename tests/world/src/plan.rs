@@ -1,6 +1,5 @@
-//! What shall happen in a world, as data: a seed, a time, and a list of timed actions. A list can be drawn by the seed,
-//! printed, parsed and cut, so that a failure can be played again with fewer actions. Refuses to know what an action
-//! does.
+//! The plan of a world as data: a seed, a duration, and a list of timed actions. The seed draws the list, which can be printed,
+//! parsed and shortened, so that a failure can be repeated with fewer actions. `actions` defines their effects.
 
 use std::fmt;
 use std::str::FromStr;
@@ -167,6 +166,54 @@ impl FromStr for Plan {
     }
 }
 
+/// Returns the plans that once ended in a violation, each with its reason. They must stay without a violation.
+///
+/// # Panics
+///
+/// If the file is not a valid corpus.
+pub fn corpus() -> Vec<(String, Plan)> {
+    let plans = CORPUS.split("\n\n").filter(|text| text.lines().any(|line| !line.starts_with('#')));
+    let parse = |text: &str| {
+        let (why, plan): (Vec<&str>, Vec<&str>) = text.lines().partition(|line| line.starts_with('#'));
+        let plan = plan.join("\n");
+        let why = why.iter().map(|line| line.trim_start_matches("# ")).collect::<Vec<_>>().join(" ");
+        let plan = plan.parse().unwrap_or_else(|error| panic!("{why}: {error}"));
+        (why, plan)
+    };
+    plans.map(parse).collect()
+}
+
+/// Plans as text with an empty line between two. Lines before each plan give its reason.
+const CORPUS: &str = include_str!("corpus.txt");
+
+/// Returns the shortest plan found for which `judge` names the same judge as for `plan`. The search leaves out halves of the
+/// actions as long as the same judge reports a violation, then quarters, down to single actions.
+pub fn shrink(plan: &Plan, mut judge: impl FnMut(&Plan) -> Option<&'static str>) -> Plan {
+    let Some(wanted) = judge(plan) else { return plan.clone() };
+    let mut best = plan.clone();
+    let mut piece = best.actions.len().div_ceil(2).max(1);
+    loop {
+        let mut from = 0;
+        let mut is_shorter = false;
+        while from < best.actions.len() {
+            let to = (from + piece).min(best.actions.len());
+            let mut less = best.clone();
+            less.actions.drain(from..to);
+            if judge(&less) == Some(wanted) {
+                best = less;
+                is_shorter = true;
+            } else {
+                from = to;
+            }
+        }
+        match (piece, is_shorter) {
+            (1, false) => return best,
+            (1, true) => {}
+            _ => piece = piece.div_ceil(2),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -188,5 +235,20 @@ mod tests {
         for wrong in ["", "seed x seconds 1", "seed 1 seconds 2\nfoo", "seed 1 seconds 2\n5 fly sensor=1"] {
             assert!(wrong.parse::<Plan>().is_err(), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn two_culprits_among_many_are_found() {
+        let plan = (0..).map(|seed| Plan::of_seed(seed, 60)).find(|plan| plan.actions.len() > 40).unwrap();
+        let culprits = [plan.actions[7].clone(), plan.actions[31].clone()];
+        let mut runs = 0;
+        let shrunk = shrink(&plan, |plan| {
+            runs += 1;
+            let has_all = culprits.iter().all(|culprit| plan.actions.contains(culprit));
+            has_all.then_some("both")
+        });
+        assert_eq!(shrunk.actions, culprits);
+        assert!(runs < 80, "{runs}");
+        assert_eq!(shrink(&plan, |_| None), plan);
     }
 }

@@ -1,11 +1,9 @@
-//! What is behind the hub's topics in another machine: a gateway, a network, a listener that publishes, and a robot that
-//! believes. Each ends and begins by itself. Refuses to know what goes wrong, and when.
+//! The other machine, which receives the topics of the hub: a gateway, a network, a listener that publishes, and a robot. Each
+//! of them starts and ends by itself.
 
 mod forger;
 mod gateway;
 mod listener;
-mod payload;
-mod robot;
 mod router;
 mod topics;
 
@@ -28,10 +26,8 @@ use crate::shared::Shared;
 use forger::Forger;
 pub(crate) use forger::Forgery;
 use gateway::Gateway;
-pub(crate) use gateway::NUMBERS as FIRST_NUMBER;
-use listener::Listener;
-pub(crate) use payload::Packet;
-use robot::RemoteRobot;
+pub(crate) use gateway::{NUMBERS as FIRST_NUMBER, Packet};
+use listener::{Listener, RemoteRobot};
 use router::Router;
 pub(crate) use router::{RECONNECTED, ROUND};
 use topics::Memory;

@@ -9,7 +9,7 @@ use scanhub_daemon::CommandSender;
 use scanhub_schema::{MILLIS, Nanos, Topic, Verb};
 use scanhub_sim::fault::Faults;
 
-use crate::actions::object;
+use crate::actions::scene_changes;
 use crate::consumer::{Consumer, Habit, Number};
 use crate::event::{Detail, Event, Figures, Violation};
 use crate::family::Ailment;
@@ -99,7 +99,7 @@ pub(crate) struct World {
 impl World {
     fn new(plan: &Plan, detail: Detail, defect: Option<Defect>, sought: &'static [&'static str]) -> World {
         let setup = Rc::new(Setup::of_plan(plan));
-        let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
+        let sensors = setup.sensors(|sensor| scene_changes(plan, sensor, setup.sensors.len()));
         let sensors = sensors.into_iter().zip(setup.impossible.iter().cloned()).enumerate();
         let ports = sensors.map(|(number, (sensor, impossible))| Tty::new(number, sensor, impossible));
         let shared = Rc::new(Shared {

@@ -7,7 +7,7 @@ use scanhub_world::{Detail, Plan, Runner, corpus, run};
 
 #[test]
 fn what_was_mended_stays_so() {
-    let plans: Vec<Plan> = corpus::corpus().into_iter().map(|(_, plan)| plan).collect();
+    let plans: Vec<Plan> = corpus().into_iter().map(|(_, plan)| plan).collect();
     are_well(plans);
 }
 

@@ -1,6 +1,7 @@
-//! Consumers come late and leave, are killed while they hold samples, and stop for a while.
+//! Actions of subscribers and users: subscribers come late and leave, are killed while they hold samples, and stop for a while.
+//! Users send requests to a link.
 
-use scanhub_schema::{MILLIS, Topic};
+use scanhub_schema::{MILLIS, Topic, Verb};
 
 use super::{Key, Kind, SENSOR};
 use crate::consumer::Habit;
@@ -10,28 +11,31 @@ use crate::world::World;
 const TOPIC: Key = Key::new("topic", 0, 6);
 const HOLDS: Key = Key::new("holds", 0, 4);
 
-pub(crate) const COMES: Kind = Kind {
+/// A subscriber attaches, and leaves after a while.
+pub(super) const COMES: Kind = Kind {
     name: "consumer_comes",
     per_minute: 6.0,
     keys: &[SENSOR, TOPIC, HOLDS, Key::new("every_ms", 0, 500), Key::new("span_ms", 10, 20_000)],
     act: |world, action| come(world, action, false),
 };
 
-pub(crate) const KILLED: Kind = Kind {
+/// A subscriber attaches, and is killed after a while.
+pub(super) const KILLED: Kind = Kind {
     name: "consumer_killed",
     per_minute: 6.0,
     keys: &[SENSOR, TOPIC, HOLDS, Key::new("every_ms", 0, 500), Key::new("span_ms", 10, 20_000)],
     act: |world, action| come(world, action, true),
 };
 
-pub(crate) const STOPS: Kind = Kind {
+/// A subscriber does not run for a while.
+pub(super) const STOPS: Kind = Kind {
     name: "consumer_stops",
     per_minute: 6.0,
     keys: &[Key::new("which", 0, 1_000), Key::new("span_ms", 10, 10_000)],
     act: stop,
 };
 
-/// One that looks every 0 ms is a prompt one.
+/// Attaches a subscriber. One that polls every 0 ms is prompt.
 fn come(world: &mut World, action: &Action, is_killed: bool) {
     let topic = Topic::OF_LINKS[action.value("topic") as usize % Topic::OF_LINKS.len()];
     let habit = match action.value("every_ms") {
@@ -44,7 +48,7 @@ fn come(world: &mut World, action: &Action, is_killed: bool) {
     }
 }
 
-/// Prompt ones always run.
+/// Stops a subscriber that is not prompt.
 fn stop(world: &mut World, action: &Action) {
     let until = world.now() + action.value("span_ms") * MILLIS;
     let mut slow: Vec<_> = world.consumers.iter_mut().filter(|consumer| !consumer.is_prompt()).collect();
@@ -52,4 +56,28 @@ fn stop(world: &mut World, action: &Action) {
     if let Some(consumer) = slow.get_mut(which) {
         consumer.stop(&world.shared, until);
     }
+}
+
+/// A user pauses a sensor, and resumes it.
+pub(super) const PAUSE: Kind = Kind {
+    name: "pause",
+    per_minute: 2.0,
+    keys: &[SENSOR, Key::new("span_ms", 10, 6_000)],
+    act: pause_sensor,
+};
+
+fn pause_sensor(world: &mut World, action: &Action) {
+    let sensor = world.sensor(action);
+    world.wants.asks.push((sensor, Verb::Pause));
+    world.later(action.value("span_ms"), move |world| world.wants.asks.push((sensor, Verb::Resume)));
+}
+
+/// A user restarts the session of a link, or resets, freezes, thaws or shows its background.
+pub(super) const RESYNC: Kind =
+    Kind { name: "resync", per_minute: 3.0, keys: &[SENSOR, Key::new("verb", 0, 4)], act: ask_link };
+
+fn ask_link(world: &mut World, action: &Action) {
+    let verbs = [Verb::Resync, Verb::Reset, Verb::Freeze, Verb::Thaw, Verb::Show];
+    let verb = verbs[action.value("verb") as usize % verbs.len()];
+    world.wants.asks.push((world.sensor(action), verb));
 }

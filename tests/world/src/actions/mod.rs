@@ -1,59 +1,30 @@
-//! What can go wrong: one file for each kind, with its name, its keys and what it does. A plan draws, prints and parses all of
-//! them alike. What an action breaks it mends itself after a while, or when everything is made well again.
+//! Actions of a plan: faults and events, each with its name, its keys and its effect. A plan draws, prints and parses all
+//! actions alike. An action undoes its effect after a while, or when the world heals.
 
-mod altered;
-mod brown_out;
 mod consumers;
-mod deaf;
-mod denied;
-mod disk_full;
-mod end_hub;
-mod exchange;
-mod garbage;
-mod gateway_killed;
-mod hold;
-mod key_errors;
-mod kill_hub;
-mod listener_killed;
-mod network_loss;
-mod network_stall;
-mod no_descriptors;
-mod no_memory;
-mod noise;
-pub(crate) mod object;
-mod pace;
-mod partition;
-mod pause;
-mod power_cycle;
-mod quirks;
-mod reload;
-mod replug_elsewhere;
-mod resync;
-mod router_killed;
-mod silence;
-mod stall;
-mod telegrams;
-mod unplug;
-mod unwell;
-mod wall_step;
+mod hub;
+mod line;
+mod network;
+mod scanner;
 
 use scanhub_schema::Nanos;
 use scanhub_sim::fault::Faults;
 
 use crate::plan::Action;
 use crate::world::World;
+pub(crate) use scanner::{objects_inside, scene_changes};
 
 /// A kind of action.
 #[derive(Debug)]
 pub(crate) struct Kind {
     pub(crate) name: &'static str,
-    /// How often it happens in a world in which it does.
+    /// Number of occurrences per minute in a world that has it.
     pub(crate) per_minute: f64,
     pub(crate) keys: &'static [Key],
     pub(crate) act: fn(&mut World, &Action),
 }
 
-/// A key of an action, and between which values it is drawn.
+/// A key of an action, and the range of its drawn values.
 #[derive(Debug)]
 pub(crate) struct Key {
     pub(crate) name: &'static str,
@@ -67,77 +38,77 @@ impl Key {
     }
 }
 
-/// The sensor that it happens to.
+/// Number of the sensor that the action affects.
 const SENSOR: Key = Key::new("sensor", 0, 1);
 
-/// All kinds. Their order is the order in which they are drawn.
+/// All kinds, in the order in which plans draw them.
 pub(crate) const KINDS: &[Kind] = &[
-    object::KIND,
-    unplug::KIND,
-    replug_elsewhere::KIND,
-    exchange::KIND,
-    power_cycle::KIND,
-    noise::KIND,
-    garbage::KIND,
-    telegrams::KIND,
-    silence::KIND,
-    quirks::KIND,
-    stall::KIND,
-    kill_hub::KIND,
-    end_hub::KIND,
-    reload::KIND,
-    disk_full::KIND,
-    no_memory::KIND,
-    no_descriptors::KIND,
-    denied::KIND,
-    wall_step::KIND,
+    scanner::OBJECT,
+    line::UNPLUG,
+    line::REPLUG_ELSEWHERE,
+    scanner::EXCHANGE,
+    scanner::POWER_CYCLE,
+    line::NOISE,
+    line::GARBAGE,
+    line::TELEGRAMS,
+    line::SILENCE,
+    scanner::HABITS,
+    hub::STALL,
+    hub::KILL_HUB,
+    hub::END_HUB,
+    hub::RELOAD,
+    hub::DISK_FULL,
+    hub::NO_MEMORY,
+    hub::NO_DESCRIPTORS,
+    line::DENIED,
+    hub::WALL_STEP,
     consumers::COMES,
     consumers::KILLED,
     consumers::STOPS,
-    pause::KIND,
-    resync::KIND,
-    network_loss::KIND,
-    partition::KIND,
-    network_stall::KIND,
-    gateway_killed::KIND,
-    listener_killed::KIND,
-    pace::KIND,
-    key_errors::KIND,
-    brown_out::KIND,
-    hold::KIND,
-    unwell::KIND,
-    deaf::KIND,
-    router_killed::KIND,
-    altered::KIND,
+    consumers::PAUSE,
+    consumers::RESYNC,
+    network::NETWORK_LOSS,
+    network::PARTITION,
+    network::NETWORK_STALL,
+    network::GATEWAY_KILLED,
+    network::LISTENER_KILLED,
+    scanner::PACE,
+    network::KEY_ERRORS,
+    scanner::BROWN_OUT,
+    scanner::HOLD,
+    scanner::UNWELL,
+    scanner::DEAF,
+    network::ROUTER_KILLED,
+    line::ALTERED,
 ];
 
-/// Gateway and listener of a world with these actions have a key.
+/// Returns whether gateway and listener of a world with these actions have a key.
 pub(crate) fn have_key(actions: &[Action]) -> bool {
-    actions.iter().any(|action| action.name() == key_errors::KIND.name)
+    actions.iter().any(|action| action.name() == network::KEY_ERRORS.name)
 }
 
-/// Gateway and listener of a world with these actions are bridges, and a router is between them.
+/// Returns whether gateway and listener of a world with these actions are bridges with a router between them.
 pub(crate) fn are_bridges(actions: &[Action]) -> bool {
-    !have_key(actions) && actions.iter().any(|action| action.name() == router_killed::KIND.name)
+    !have_key(actions) && actions.iter().any(|action| action.name() == network::ROUTER_KILLED.name)
 }
 
-/// What `action` does to the bytes on a line from `now` on, if it is of such a kind.
+/// Returns the faults that `action` causes on its line from `now` on, if it affects bytes.
 pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {
     let name = action.name();
-    if name == silence::KIND.name {
-        return Some(silence::faults(action, now, Nanos::MAX));
+    if name == line::SILENCE.name {
+        return Some(line::silence_faults(action, now, Nanos::MAX));
     }
     type Of = (&'static Kind, fn(&Action) -> Faults);
     let of: [Of; 3] = [
-        (&garbage::KIND, garbage::faults),
-        (&noise::KIND, noise::faults),
-        (&telegrams::KIND, telegrams::faults),
+        (&line::GARBAGE, line::garbage_faults),
+        (&line::NOISE, line::noise_faults),
+        (&line::TELEGRAMS, line::telegram_faults),
     ];
     of.into_iter().find(|(kind, _)| kind.name == name).map(|(_, faults)| faults(action))
 }
 
 impl Kind {
-    /// Values for its keys: small ones as often as great ones where the range is wide.
+    /// Draws values for the keys. Where a range is wide, their logarithms are evenly distributed.
     pub(crate) fn draw(&self, random: &mut fastrand::Rng) -> Vec<u64> {
         let value = |key: &Key| match key {
             Key { least, most, .. } if *most > 20 * (*least).max(1) => {

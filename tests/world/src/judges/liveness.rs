@@ -1,16 +1,18 @@
-//! When nothing goes wrong any more, everything comes back soon: each link says that it streams, and publishes measured
-//! values; and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now
-//! and then. The search for a scanner of another family begins after ten seconds without data.
+//! Judges of recovery: once nothing is wrong any more, everything works again soon.
 
 use std::rc::Rc;
 
-use scanhub_schema::{MILLIS, Nanos, State, Status, Topic};
+use scanhub_schema::{MILLIS, Nanos, State, Status, Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::{Event, Figures};
 use crate::family::Family;
+use crate::remote::{RECONNECTED, ROUND, Terms};
+use crate::setup::Setup;
 
-/// Since when nothing goes wrong, and what has come back.
+/// Judge: once nothing is wrong any more, each link soon reports that it streams, and publishes measured values. It publishes
+/// scans as soon as the scanner has reported how its values are split; the session repeats that request now and then. The
+/// search for a scanner of another family starts after ten seconds without data.
 pub(crate) struct Liveness {
     healed: Option<Nanos>,
     sensors: Vec<OfSensor>,
@@ -120,3 +122,95 @@ impl Judge for Liveness {
 const SOON: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
 /// Time after which the search begins again because nothing of the scanner arrives.
 const LOST_AFTER: Nanos = 10_000 * MILLIS;
+
+/// Judge: once nothing is wrong any more, a remote robot soon knows what the hub knows. The next announcement names the sensor,
+/// and then the next zones are sent. The robot knows the verdict from then on, unless the zones are so rare that the first
+/// ones, which have no period yet, expire before the second ones arrive (`docs/topics.md`).
+pub(crate) struct RemoteLiveness {
+    is_healed: bool,
+    sensors: Vec<RemoteSensor>,
+}
+
+struct RemoteSensor {
+    /// From known zones in the hub to known ones here, at most.
+    soon: Nanos,
+    /// Zones come less often than a verdict stands whose period is not known.
+    is_slow: bool,
+    /// Since when the hub says what it knows, if it does.
+    said_since: Option<Nanos>,
+    is_known: bool,
+    /// It was known since all was well.
+    came: bool,
+}
+
+impl RemoteLiveness {
+    pub(crate) fn new(setup: &Setup, terms: &Terms) -> RemoteLiveness {
+        let sensor = |of: usize| {
+            let (period, _) = setup.sensors[of].times();
+            let every = terms.every.get() * period;
+            // A router that comes back with all else is found within so long, and what waited goes out.
+            let over_router = if terms.are_bridges { RECONNECTED + ROUND } else { 0 };
+            let soon = ANNOUNCED + every + period + terms.delay_ns + over_router + SLACK;
+            RemoteSensor { soon, is_slow: every > OFTEN, said_since: None, is_known: false, came: false }
+        };
+        RemoteLiveness { is_healed: false, sensors: (0..setup.sensors.len()).map(sensor).collect() }
+    }
+}
+
+impl Judge for RemoteLiveness {
+    fn name(&self) -> &'static str {
+        "remote_liveness"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Healed => {
+                self.is_healed = true;
+                self.sensors.iter_mut().for_each(|of| (of.said_since, of.came) = (None, of.is_known));
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Zones => {
+                let zones: Zones = bytemuck::pod_read_unaligned(&sample.bytes);
+                let of = &mut self.sensors[sensor];
+                match zones.verdict() {
+                    Verdict::Unknown => of.said_since = None,
+                    _ => _ = of.said_since.get_or_insert(at),
+                }
+                of.check(sensor, at, self.is_healed, say);
+            }
+            Event::RemoteBelieves { sensor, verdict } => {
+                let of = &mut self.sensors[sensor];
+                of.check(sensor, at, self.is_healed, say);
+                of.is_known = verdict != Verdict::Unknown;
+                of.came |= of.is_known;
+            }
+            Event::Over { .. } => {
+                for (sensor, of) in self.sensors.iter().enumerate() {
+                    of.check(sensor, at, self.is_healed, say);
+                }
+            }
+            Event::ListenerEnds { sensors, .. } if self.is_healed && sensors != self.sensors.len() => {
+                say.broken(format!("{sensors} sensors are published at the end"));
+            }
+            _ => {}
+        }
+    }
+}
+
+impl RemoteSensor {
+    fn check(&self, sensor: usize, at: Nanos, is_healed: bool, say: &mut Say<'_>) {
+        if is_healed
+            && !(self.is_known || self.is_slow && self.came)
+            && let Some(since) = self.said_since.filter(|since| at > since + self.soon)
+        {
+            let (ms, soon) = ((at - since) / MILLIS, self.soon / MILLIS);
+            say.broken(format!("sensor {sensor}: nothing is known {ms} ms later, bound {soon}"));
+        }
+    }
+}
+
+/// Zones that are sent at least so often are always known.
+const OFTEN: Nanos = 230 * MILLIS;
+/// Between two announcements.
+const ANNOUNCED: Nanos = 1_000 * MILLIS;
+/// Threads and timers are late by no more than this, all together.
+const SLACK: Nanos = 3 * MILLIS;

@@ -1,27 +1,14 @@
-//! The judges: each watches everything that happens for one promise, and says when it is broken. None knows another,
-//! nor what a plan wants.
+//! Invariants of a world, which the simulator calls judges: each watches every event for one promise and reports when it is
+//! broken. A judge knows neither the other judges nor the intent of a plan.
 
 mod accounts;
-mod bytes;
 mod early;
-mod eeprom;
-mod family;
+mod invented;
 mod liveness;
-mod lost_on_line;
-mod nothing_invented;
-mod nothing_lost;
+mod lost;
 mod numbers;
-mod prompt;
 mod recording;
-mod remote_accounts;
-mod remote_bridge;
-mod remote_keys;
-mod remote_liveness;
-mod remote_nothing_invented;
-mod remote_numbers;
-mod remote_verdict;
-mod resources;
-mod settings;
+mod scanner;
 mod stamps;
 mod turns;
 mod verdict;
@@ -68,30 +55,30 @@ impl Say<'_> {
 pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
     let (sensors, terms) = (&setup.sensors[..], Terms::of_plan(plan));
     vec![
-        Box::new(bytes::Bytes::new(sensors.len())),
+        Box::new(lost::Bytes::new(sensors.len())),
         Box::new(accounts::Accounts::default()),
         Box::new(numbers::Numbers::new(sensors)),
-        Box::new(nothing_invented::NothingInvented::new(sensors)),
-        Box::new(nothing_lost::NothingLost::new(sensors)),
+        Box::new(invented::NothingInvented::new(sensors)),
+        Box::new(lost::NothingLost::new(sensors)),
         Box::new(turns::Turns::new(sensors)),
         Box::new(stamps::Stamps::new(sensors)),
-        Box::new(lost_on_line::LostOnLine::new(sensors)),
-        Box::new(prompt::Prompt::default()),
+        Box::new(lost::LostOnLine::new(sensors)),
+        Box::new(stamps::Prompt::default()),
         Box::new(early::Early::default()),
         Box::new(recording::Recording::new(plan.seed)),
-        Box::new(verdict::OfRobot::new(setup, plan)),
+        Box::new(verdict::LocalVerdict::new(setup, plan)),
         Box::new(liveness::Liveness::new(sensors)),
-        Box::new(settings::Settings::new(sensors.len())),
-        Box::new(resources::Resources),
-        Box::new(eeprom::Eeprom),
-        Box::new(family::OfSensors::new(sensors)),
-        Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
-        Box::new(remote_accounts::RemoteAccounts::default()),
-        Box::new(remote_bridge::RemoteBridge::new(&terms)),
-        Box::new(remote_keys::RemoteKeys::default()),
-        Box::new(remote_numbers::RemoteNumbers::new(terms)),
-        Box::new(remote_verdict::RemoteVerdict::new(setup, plan, &terms)),
-        Box::new(remote_liveness::RemoteLiveness::new(setup, &terms)),
+        Box::new(scanner::Settings::new(sensors.len())),
+        Box::new(accounts::Resources),
+        Box::new(scanner::Eeprom),
+        Box::new(scanner::Families::new(sensors)),
+        Box::new(invented::RemoteNothingInvented::new(&terms)),
+        Box::new(accounts::RemoteAccounts::default()),
+        Box::new(accounts::RemoteBridge::new(&terms)),
+        Box::new(invented::RemoteKeys::default()),
+        Box::new(numbers::RemoteNumbers::new(terms)),
+        Box::new(verdict::RemoteVerdict::new(setup, plan, &terms)),
+        Box::new(liveness::RemoteLiveness::new(setup, &terms)),
     ]
 }
 

@@ -1,17 +1,19 @@
-//! What headers say fits together: numbers grow, stamps are neither of the future nor go back, and what was made of a telegram
-//! has its number, its stamps and its quality.
+//! Judges of headers: numbers, stamps and periods.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use scanhub_schema::{Header, Nanos, Topic};
+use scanhub_schema::datagram::Head;
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Topic};
 
 use super::{Judge, Say};
-use crate::event::Event;
+use crate::event::{Arrival, Event};
 use crate::family::Family;
+use crate::remote::Terms;
 use crate::topics::Sample;
 
-/// The last headers.
+/// Judge: headers are consistent. Numbers increase, stamps are neither in the future nor decrease, and every sample that is
+/// derived from a telegram has its number, stamps and quality.
 pub(crate) struct Numbers {
     /// Of which sample of a sensor all others are made that say when they were sent.
     sources: Vec<Topic>,
@@ -69,3 +71,121 @@ impl Judge for Numbers {
         }
     }
 }
+
+/// Judge: a listener publishes the numbers, stamps and periods of `docs/topics.md`. The number is the datagram's and continues
+/// over runs of the gateway. Both stamps are the time of arrival. The period is the median of the last five intervals between
+/// two samples as sent. No sample that arrived in time is left out once its topic exists.
+pub(crate) struct RemoteNumbers {
+    terms: Terms,
+    topics: BTreeMap<(usize, Topic), OfTopic>,
+}
+
+#[derive(Default)]
+struct OfTopic {
+    /// What came in time and was not published yet: when it came, and its header.
+    taken: VecDeque<(Nanos, Head)>,
+    /// The last one that was published of them.
+    last: Option<(Nanos, Head)>,
+    /// The last number here.
+    number: Option<u64>,
+    distances_ns: VecDeque<Nanos>,
+}
+
+impl RemoteNumbers {
+    pub(crate) fn new(terms: Terms) -> RemoteNumbers {
+        RemoteNumbers { terms, topics: BTreeMap::new() }
+    }
+}
+
+impl Judge for RemoteNumbers {
+    fn name(&self) -> &'static str {
+        "remote_numbers"
+    }
+
+    fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::ListenerBegins { .. } => self.topics.clear(),
+            Event::Arrived {
+                came,
+                datagram: Some(datagram),
+                outcome: Arrival::Sample { late: false },
+                ..
+            } => {
+                let head = datagram.head;
+                if let Some(topic) = Topic::of_number(head.topic) {
+                    let of = self.topics.entry((head.sensor.into(), topic)).or_default();
+                    of.taken.push_back((came, head));
+                }
+            }
+            Event::Republished { sensor, topic, header, .. } => {
+                let of = self.topics.entry((sensor, topic)).or_default();
+                if let Err(words) = of.publish(header, self.terms.clocks.monotonic_ns) {
+                    say.broken(format!("sensor {sensor}, {topic:?}: {words}: {header:?}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl OfTopic {
+    /// `header` was published; what is wrong with it.
+    fn publish(&mut self, header: &Header, begin_ns: u64) -> Result<(), String> {
+        let before = self.number.replace(header.topic_seq);
+        if header.flags & Flags::REMOTE == 0 || header.stamp_first_ns != header.stamp_last_ns {
+            return Err("not as a remote one".to_owned());
+        }
+        let is_it = |(came, head): &(Nanos, Head)| {
+            let Head { counter, stamp_ns, .. } = *head;
+            let of = (begin_ns + came, u64::from(counter), stamp_ns);
+            of == (header.stamp_last_ns, header.seq, header.wall_ns)
+        };
+        let Some(at) = self.taken.iter().position(is_it) else {
+            // It stands for a silence.
+            let due = before.map_or(0, |before| before + 1);
+            return if header.topic_seq == due {
+                Ok(())
+            } else {
+                Err(format!("{due} is the number of a silence"))
+            };
+        };
+        let passed: Vec<_> = self.taken.drain(..at).collect();
+        let Some((came, head)) = self.taken.pop_front() else { return Ok(()) };
+        let last = self.last.replace((came, head));
+        let left_out =
+            passed.iter().filter(|(_, passed)| last.is_some_and(|(_, last)| last.epoch == passed.epoch));
+        let left_out = left_out.count();
+        let steps =
+            last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
+        if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
+            // One that came earlier by its time tells no period.
+            let distance_ns = came.checked_sub(last_came).map(|apart| apart / u64::from(steps));
+            self.distances_ns.extend(distance_ns.filter(|distance_ns| *distance_ns <= LONGEST));
+            if self.distances_ns.len() > KEPT {
+                self.distances_ns.pop_front();
+            }
+        }
+        let mut known: Vec<_> = self.distances_ns.iter().copied().collect();
+        known.sort_unstable();
+        let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
+        // The first number of a life of the listener is the datagram's; those that are not heard of another gateway count.
+        let due = match (before, steps) {
+            (Some(before), Some(steps)) => before + u64::from(steps),
+            (Some(before), None) => before + 1 + u64::from(head.sequence),
+            (None, _) => head.sequence.into(),
+        };
+        if header.topic_seq != due {
+            Err(format!("{due} is its number"))
+        } else if u64::from(header.period_us) != period_us {
+            Err(format!("{period_us} us is its period"))
+        } else if left_out > 0 {
+            Err(format!("{left_out} that came were left out before it"))
+        } else {
+            Ok(())
+        }
+    }
+}
+
+/// So many times between two samples tell the period, but none that is longer.
+const KEPT: usize = 5;
+const LONGEST: Nanos = 2_500 * MILLIS;

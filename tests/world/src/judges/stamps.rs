@@ -1,19 +1,19 @@
-//! The stamps of a scan's telegram are right, or they are marked as estimates. Without the mark, they are the times at which
-//! the telegram's first and last bytes went into the port, even if the hub was held up. While nothing goes wrong, no stamp of
-//! a streaming scanner is an estimate. Only families whose samples are single telegrams; `turns`
-//! checks the others.
+//! Judges of time: stamps of telegrams, and the delay until a subscriber wakes.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use scanhub_schema::{Flags, Header, MILLIS, Nanos, Topic, line_time};
+use scanhub_schema::{Flags, Header, MILLIS, Nanos, Ring, Topic, line_time};
 
 use super::{Judge, Say};
+use crate::consumer::Number;
 use crate::event::{Event, Telegram};
 use crate::family::Family;
 use crate::topics::Sample;
 
-/// Telegrams of each sensor that were sent and not published yet.
+/// Judge: the stamps of a scan's telegram are right, or the hub marks them as estimates. Without the mark, they are the times at
+/// which the first and last bytes of the telegram went into the port, even if the hub was held up. While nothing is wrong, no
+/// stamp of a streaming scanner is an estimate. Only families whose samples are single telegrams; `turns` checks the others.
 pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, OfSensor>,
@@ -138,3 +138,62 @@ const RECOVERED: Nanos = 3_000 * MILLIS;
 const SETTLED: usize = 8;
 /// Telegrams that are remembered: more than a port holds.
 const MOST: usize = 256;
+
+/// Judge: the hub wakes a sleeping subscriber. A prompt subscriber has each sample of a telegram a moment after the telegram was
+/// sent, and a subscriber to zones need not wait for the marks of the same scan.
+#[derive(Default)]
+pub(crate) struct Prompt {
+    /// When prompt consumers came.
+    came: BTreeMap<Number, Nanos>,
+    /// The topics that consumers follow.
+    followed: BTreeMap<Number, (usize, Topic)>,
+    /// For each sensor the number of the telegram of which a sample was sent to somebody who has not been woken for it yet.
+    asleep: BTreeMap<usize, u64>,
+}
+
+impl Judge for Prompt {
+    fn name(&self) -> &'static str {
+        "prompt"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Attached { consumer, sensor, topic, is_prompt } => {
+                self.followed.insert(consumer, (sensor, topic));
+                if is_prompt {
+                    self.came.insert(consumer, at);
+                }
+            }
+            Event::Left { consumer, .. } => {
+                self.followed.remove(&consumer);
+            }
+            Event::Published { sensor, sample } if sample.header.hub_time_ns().is_some() => {
+                let (topic, seq) = (sample.topic, sample.header.seq);
+                if topic.row().ring == Ring::Last && self.asleep.get(&sensor) == Some(&seq) {
+                    say.broken(format!("{topic:?} of {seq} were made while those who wait for zones slept"));
+                }
+                let is_wanted = self.followed.values().any(|followed| *followed == (sensor, topic));
+                if matches!(topic, Topic::Scan | Topic::Zones) && is_wanted {
+                    self.asleep.insert(sensor, seq);
+                }
+            }
+            Event::Rung { sensor, ring: Ring::First } => {
+                self.asleep.remove(&sensor);
+            }
+            Event::HubEnds { .. } => self.asleep.clear(),
+            Event::Taken { consumer, sample, .. } => {
+                let came = self.came.get(&consumer);
+                let is_of_telegram = sample.header.hub_time_ns().is_some();
+                let late = at.saturating_sub(sample.at);
+                if is_of_telegram && late > LATEST && came.is_some_and(|&came| sample.at > came) {
+                    let us = late / 1_000;
+                    say.broken(format!("consumer {} got {:?} after {us} us", consumer.0, sample.topic));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Of a machine with processors to spare.
+const LATEST: Nanos = 2 * MILLIS;

@@ -5,22 +5,19 @@
 //! A stamp can only be right once the hub has heard a packet without delay: before that, nobody can tell a line that is
 //! late from a scanner that is.
 
-mod found;
-mod points;
-mod sent;
-
 use std::cell::Cell;
+use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
 use scanhub_schema::datagram::Packed;
-use scanhub_schema::{Header, MICROS, MILLIS, Nanos, Scan, State, Status, Topic};
+use scanhub_schema::{Code, Header, MICROS, MILLIS, Nanos, Scan, State, Status, Topic};
 use scanhub_sim::ld::TruePoint;
 
-use self::points::{Point, Told, told};
 use super::{Judge, Say};
-use crate::event::{Event, Figures};
+use crate::event::{Event, Figures, Telegram};
 use crate::family::{Begin, Exactness, Family};
+use crate::hash::History;
 use crate::topics::Sample;
 
 /// What each sensor whose head turns measured.
@@ -323,6 +320,105 @@ impl OfSensor {
         }
         Ok(figures)
     }
+
+    fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
+        let (begin, end) = (std::mem::replace(&mut self.end, telegram.span.1), telegram.span.1);
+        if telegram.is_reply {
+            return;
+        }
+        if telegram.damage.is_none() {
+            // The line lost all that came between: where nothing else tells, what waits behind it has no time yet.
+            if !self.exactness.has_clock && self.arrived_at + LONG_GAP < at {
+                self.begin();
+            }
+            self.arrived_at = at;
+        }
+        let key = History::of(telegram.bytes);
+        let is_double = self.order.back() == Some(&key);
+        *self.sent.entry(key).or_default() += 1;
+        self.order.push_back(key);
+        if is_double || end - begin > telegram.bytes.len() as u64 {
+            self.crowded_at = Some(at);
+        }
+        self.forgotten += usize::from(self.order.len() > MOST);
+        if self.order.len() > MOST
+            && let Some(Entry::Occupied(mut oldest)) =
+                self.order.pop_front().map(|oldest| self.sent.entry(oldest))
+        {
+            *oldest.get_mut() -= 1;
+            if *oldest.get() == 0 {
+                oldest.remove();
+            }
+        }
+        if telegram.damage.is_none()
+            && let Some(begin) = self.family.begin(telegram.bytes)
+            && let Some(measured) = self.last_of(at, &begin, self.family.exactness(telegram.bytes))
+            && at < measured + begin.on_line + PROMPT
+        {
+            self.prompt = Some((telegram.span.1, at));
+        }
+    }
+
+    /// Whether `unit`, which is published, was sent. Single points without a checksum are so short that pieces of two often
+    /// are one that was sent before: they have to come in their order, too.
+    fn was_sent(&mut self, unit: &[u8]) -> bool {
+        let key = History::of(unit);
+        if self.exactness.neighbours == 0 {
+            return self.sent.contains_key(&key);
+        }
+        let begin = self.passed.saturating_sub(self.forgotten);
+        // What a line doubles was sent once.
+        let is_last = begin.checked_sub(1).and_then(|last| self.order.get(last)) == Some(&key);
+        let ahead = self.order.iter().skip(begin).position(|sent| *sent == key);
+        if !is_last && let Some(ahead) = ahead {
+            self.passed = self.forgotten + begin + ahead + 1;
+        }
+        is_last || ahead.is_some()
+    }
+
+    /// The point that `told` is, if it was measured `shift` after what is told, or less than `lenience` beside.
+    fn find(&self, told: &Told, shift: i64, lenience: Nanos) -> Option<&Point> {
+        let at_ns = told.at_ns.saturating_add_signed(shift);
+        let begin = self.points.partition_point(|point| point.truth.at_ns + lenience < at_ns);
+        let near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + lenience);
+        near.into_iter().find(|point| point.is(told, &self.exactness))
+    }
+
+    /// Whether all of `told` were measured one or several turns of `period` later than told, the same for all.
+    fn is_of_later_turn(&self, told: &[Told], period: Nanos, lenience: impl Fn(&Told) -> Nanos) -> bool {
+        let shift = self.shift(told);
+        shift > period as i64 / 2 && told.iter().all(|told| self.find(told, shift, lenience(told)).is_some())
+    }
+
+    /// How many points of `told` are where nothing was measured within 5 cm.
+    fn wrong(&self, told: &[Told], shift: i64) -> u64 {
+        let exactness = Exactness { angle_deg: 1.0, range_mm: 50.0, ..self.exactness };
+        let is_wrong = |told: &&Told| {
+            let at_ns = told.at_ns.saturating_add_signed(shift);
+            let begin = self.points.partition_point(|point| point.truth.at_ns + FAR_NS < at_ns);
+            let mut near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + FAR_NS);
+            !near.any(|point| point.is(told, &exactness))
+        };
+        told.iter().filter(is_wrong).count() as u64
+    }
+
+    /// By how much most points were measured later than is told. From turn to turn a head is nearly where it was before: of the
+    /// turns that fit, the one that fits best.
+    fn shift(&self, told: &[Told]) -> i64 {
+        let Some(first) = told.iter().find(|told| told.range_mm.is_some()) else { return 0 };
+        let fit = |told: &mut dyn Iterator<Item = &Told>, shift: i64| {
+            told.filter(|told| self.find(told, shift, NEAR).is_some()).count()
+        };
+        let some = told.len().div_ceil(16);
+        let candidates = self.points.iter().filter(|point| point.is(first, &self.exactness));
+        let shifts = candidates.map(|point| point.truth.at_ns as i64 - first.at_ns as i64);
+        let mut shifts: Vec<_> =
+            shifts.map(|shift| (fit(&mut told.iter().step_by(some), shift), shift)).collect();
+        let most = shifts.iter().map(|(count, _)| *count).max().unwrap_or(0);
+        shifts.retain(|(count, _)| count + 1 >= most);
+        let best = shifts.iter().max_by_key(|(_, shift)| (fit(&mut told.iter(), *shift), -shift.abs()));
+        best.map_or(0, |(_, shift)| *shift)
+    }
 }
 
 /// A point may lie so far before one that was measured before it.
@@ -354,3 +450,70 @@ const POWER_OFF: Nanos = 50 * MILLIS;
 /// What was measured is remembered for so long, and so many packets are.
 const REMEMBERED: Nanos = 12_000 * MILLIS;
 const MOST: usize = 65_536;
+/// A wrong point is where nothing was measured in so long.
+const FAR_NS: Nanos = 15 * MILLIS;
+
+/// A point that was measured.
+#[derive(Clone, Copy, PartialEq)]
+struct Point {
+    truth: TruePoint,
+    /// Degrees since the first one, turns and all.
+    turned_deg: f64,
+}
+
+/// What a scan tells of a point.
+#[derive(Debug)]
+struct Told {
+    at_ns: Nanos,
+    clockwise_deg: f64,
+    range_mm: Option<u16>,
+}
+
+/// The beams of `scan` that were measured.
+fn told(stamp: Nanos, scan: &Scan) -> Vec<Told> {
+    let beams = (0..scan.beams()).filter(|&i| scan.code(i) != Some(Code::NotMeasured));
+    let told = |i: usize| Told {
+        at_ns: stamp.saturating_add_signed(scan.beam_ns(i)),
+        clockwise_deg: (-scan.angle(i).to_degrees()).rem_euclid(360.0),
+        range_mm: scan.range(i),
+    };
+    beams.map(told).collect()
+}
+
+impl Point {
+    /// Whether it is what is told: a scanner may see nothing where there is something.
+    fn is(&self, told: &Told, exactness: &Exactness) -> bool {
+        let (is_there, most_deg) = match (told.range_mm, self.truth.range_mm) {
+            (Some(told), Some(exact)) => {
+                ((f64::from(told) - exact).abs() < exactness.range_mm, exactness.angle_deg)
+            }
+            (Some(_), None) => (false, 0.0),
+            (None, _) => (true, exactness.nothing_deg),
+        };
+        is_there && self.off_deg(told.clockwise_deg) < most_deg
+    }
+
+    fn off_deg(&self, clockwise_deg: f64) -> f64 {
+        ((self.truth.clockwise_deg - clockwise_deg + 180.0).rem_euclid(360.0) - 180.0).abs()
+    }
+}
+
+impl Figures {
+    fn of(scan: &Scan, told: &[Told], points: &[Option<&Point>]) -> Figures {
+        let pairs = || told.iter().zip(points).filter_map(|(told, point)| Some((told, (*point)?)));
+        let worst = |off: &dyn Fn((&Told, &Point)) -> f64| pairs().map(off).fold(0.0, f64::max);
+        let range_mm = |(told, point): (&Told, &Point)| {
+            told.range_mm
+                .zip(point.truth.range_mm)
+                .map_or(0.0, |(told, exact)| (f64::from(told) - exact).abs())
+        };
+        Figures {
+            scans: 1,
+            incomplete: scan.is_incomplete().into(),
+            points: pairs().count() as u64,
+            angle_deg: worst(&|(told, point)| point.off_deg(told.clockwise_deg)),
+            range_mm: worst(&range_mm),
+            ..Figures::default()
+        }
+    }
+}

@@ -1,14 +1,12 @@
-//! A life of a gateway: it follows topics of the hub as any consumer, and hands datagrams to a network. Refuses to know what
-//! becomes of those.
+//! A run of a gateway: it subscribes to topics of the hub like any subscriber, and passes datagrams to a network.
 
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Noted, Numbers, ZonesState};
 use scanhub_lan::Stamp;
 use scanhub_lan::outgoing::{ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit};
-use scanhub_schema::datagram::Datagram;
+use scanhub_schema::datagram::{Datagram, HEAD, PARTS};
 use scanhub_schema::{MILLIS, Nanos, Topic};
 
-use super::payload::lend;
 use super::{Terms, WAKES};
 use crate::consumer::Number;
 use crate::event::Event;
@@ -217,3 +215,54 @@ pub(crate) const NUMBERS: u32 = 1_000_000;
 const TICK: Nanos = ANNOUNCE_EVERY.as_nanos() as Nanos;
 /// A hub that lives hands what it keeps to newcomers within so long, and wakes nobody for it.
 const GREETING: Nanos = 110 * MILLIS;
+
+/// Defines `lend`, which reads the bytes of a sample by the table of topics.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        /// Passes the payload of `sample` to `to`.
+        fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
+            match sample.topic {
+                $(scanhub_schema::Topic::$topic => to(PayloadRef::$topic(payloads!($payload sample))),)*
+            }
+        }
+    };
+    ([u8] $sample:ident) => {
+        &$sample.bytes
+    };
+    (Scan $sample:ident) => {
+        &scanhub_schema::Scan::of_bytes(&$sample.bytes)
+    };
+    (Foreground $sample:ident) => {
+        &scanhub_schema::Foreground::of_bytes(&$sample.bytes)
+    };
+    (Background $sample:ident) => {
+        &scanhub_schema::Background::of_bytes(&$sample.bytes)
+    };
+    (Cloud $sample:ident) => {
+        &scanhub_schema::Cloud::of_bytes(&$sample.bytes)
+    };
+    ($payload:ident $sample:ident) => {
+        &bytemuck::pod_read_unaligned::<scanhub_schema::$payload>(&$sample.bytes)
+    };
+}
+
+scanhub_schema::for_each_topic!(payloads);
+
+/// Buffer for a payload as in datagrams. Its size limits some payloads.
+pub(crate) struct Packet {
+    room: Vec<u8>,
+}
+
+impl Packet {
+    pub(crate) fn new(terms: &Terms) -> Packet {
+        // A bridge sends samples whole.
+        let room = if terms.are_bridges { u16::MAX.into() } else { PARTS * (terms.longest - HEAD) };
+        Packet { room: vec![0; room] }
+    }
+
+    /// Returns the payload of `sample` in datagrams, or `None` if it does not fit.
+    pub(crate) fn of(&mut self, sample: &Sample) -> Option<&[u8]> {
+        let len = lend(sample, |payload| payload.pack(&mut self.room))?;
+        self.room.get(..len)
+    }
+}

@@ -1,19 +1,21 @@
-//! A life of a listener: it takes datagrams in the order in which they came, and publishes what they say. Refuses to know who
-//! follows that.
+//! A run of a listener, and a robot that follows its topics. The listener takes datagrams in the order in which they arrived, and
+//! publishes their samples. The robot follows the zones of remote sensors by the rules of the client library.
 
 use std::collections::{HashMap, VecDeque};
 
+use scanhub_client::Robot;
+use scanhub_client::streams::ZonesState;
 use scanhub_lan::Stamp;
 use scanhub_lan::incoming::{Arrived, Incoming};
 use scanhub_lan::republish::Republisher;
-use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head};
-use scanhub_schema::{Nanos, Topic};
+use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, Packed};
+use scanhub_schema::{Nanos, Topic, Verdict, Zones};
 
-use super::robot::GATEWAY;
-use super::topics::Memory;
+use super::topics::{Memory, Published};
 use super::{LOOKS, Terms, WAKES};
 use crate::event::{Arrival, Event};
 use crate::planted::Defect;
+use crate::setup::Setup;
 use crate::shared::Shared;
 
 /// The listener.
@@ -174,3 +176,64 @@ const PID: u32 = 77;
 const TURN: usize = 64;
 /// Bytes that wait in the kernel.
 const ROOM: usize = 1 << 20;
+
+/// A subscriber to all topics of all remote sensors.
+pub(super) struct RemoteRobot {
+    robot: Robot,
+    /// The sensors' names, what is known of their zones, and what was believed last.
+    sensors: Vec<(String, ZonesState, Verdict)>,
+}
+
+impl RemoteRobot {
+    pub(super) fn new(terms: &Terms, sensors: usize) -> RemoteRobot {
+        let mut robot = Robot::default();
+        let mut follow = |number| {
+            let name = format!("{GATEWAY}.{}", Setup::name(number));
+            robot.expect(&name);
+            (name, ZonesState::new(terms.moment(0)), Verdict::Unknown)
+        };
+        let sensors = (0..sensors).map(&mut follow).collect();
+        RemoteRobot { robot, sensors }
+    }
+
+    /// When a verdict is too old, if nothing comes.
+    pub(super) fn next_ns(&self, terms: &Terms, now: Nanos) -> Nanos {
+        let left = self.sensors.iter().filter_map(|(_, state, _)| state.left(terms.moment(now)));
+        left.min().map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos))
+    }
+
+    /// Takes what waits, and sees what does not come.
+    pub(super) fn run(&mut self, shared: &Shared, terms: &Terms, memory: &Memory, now: Nanos) {
+        let moment = terms.moment(now);
+        for (sensor, (name, state, believed)) in self.sensors.iter_mut().enumerate() {
+            for Published { topic, header, mut payload } in memory.take(name) {
+                if shared.planted.strikes(Defect::RemoteAltered, 100) {
+                    payload[0] ^= 1;
+                }
+                let republished = Event::Republished { sensor, topic, header: &header, payload: &payload };
+                shared.log.tell(now, &republished);
+                let mut zones = Zones::default();
+                if topic == Topic::Zones && zones.unpack(&payload) {
+                    self.robot.hear(sensor, state.take(&header, &zones, 0, moment).zones);
+                    believe(shared, now, sensor, believed, &self.robot);
+                }
+            }
+            if let Some(silence) = state.silence(moment)
+                && !shared.planted.is(Defect::RemoteSurvivingVerdict)
+            {
+                self.robot.hear(sensor, silence.zones);
+                believe(shared, now, sensor, believed, &self.robot);
+            }
+        }
+    }
+}
+
+fn believe(shared: &Shared, now: Nanos, sensor: usize, believed: &mut Verdict, robot: &Robot) {
+    let verdict = robot.sensors().nth(sensor).map_or(Verdict::Unknown, |(_, verdict)| verdict);
+    if std::mem::replace(believed, verdict) != verdict {
+        shared.log.tell(now, &Event::RemoteBelieves { sensor, verdict });
+    }
+}
+
+/// What the gateway is called where the listener is.
+const GATEWAY: &str = "robot1";

@@ -1,6 +1,4 @@
-//! A sample has the family of the scanner. At a link without a family, what is published before the scanner is found
-//! has none: never a telegram or a scan, and a status only while the hub searches or has no port. No byte is sent to an
-//! LDROBOT that streams undisturbed.
+//! Judges of the hub's access to a scanner: its family, the rate of its port, and its EEPROM.
 
 use std::rc::Rc;
 
@@ -11,8 +9,10 @@ use crate::event::{Event, Telegram};
 use crate::family::{Family, is_ld_packet};
 use crate::topics::Sample;
 
-/// The families of all sensors, and since when their scanners have been streaming.
-pub(crate) struct OfSensors(Vec<OfSensor>);
+/// Judge: a sample has the family of its scanner. At a link without a family, samples have none until the scanner is found: the
+/// link publishes no telegram and no scan, and a status only while the hub searches or has no port. The hub sends no byte to an
+/// LDROBOT that streams undisturbed.
+pub(crate) struct Families(Vec<OfSensor>);
 
 struct OfSensor {
     /// The family, or both families of a scanner that is exchanged for a scanner of another family.
@@ -28,8 +28,8 @@ struct OfSensor {
     end: u64,
 }
 
-impl OfSensors {
-    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> OfSensors {
+impl Families {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> Families {
         let sensor = |family: &Rc<dyn Family>| OfSensor {
             families: family.families(),
             is_auto: family.keys().iter().any(|key| key == "family=auto"),
@@ -39,11 +39,11 @@ impl OfSensors {
             last_at: 0,
             end: 0,
         };
-        OfSensors(sensors.iter().map(sensor).collect())
+        Families(sensors.iter().map(sensor).collect())
     }
 }
 
-impl Judge for OfSensors {
+impl Judge for Families {
     fn name(&self) -> &'static str {
         "family"
     }
@@ -124,3 +124,75 @@ const GAP: Nanos = 50 * MILLIS;
 const SEARCH: Nanos = 4_000 * MILLIS;
 /// Time after which the search begins again because nothing of the scanner arrives.
 const LOST_AFTER: Nanos = 10_000 * MILLIS;
+
+/// Judge: a port that another process sets to another rate soon has the hub's rate again. The hub does not read bytes at the
+/// wrong rate for a whole second.
+pub(crate) struct Settings {
+    sensors: Vec<PortOfSensor>,
+}
+
+#[derive(Clone, Copy, Default)]
+struct PortOfSensor {
+    is_altered: bool,
+    /// Time of the first read since the alteration, or since the last telegram.
+    reads_since: Option<Nanos>,
+    /// The last read was too long after it.
+    is_overdue: bool,
+}
+
+impl Settings {
+    pub(crate) fn new(sensors: usize) -> Settings {
+        Settings { sensors: vec![PortOfSensor::default(); sensors] }
+    }
+}
+
+impl Judge for Settings {
+    fn name(&self) -> &'static str {
+        "settings"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Altered { sensor } => {
+                self.sensors[sensor] = PortOfSensor { is_altered: true, ..PortOfSensor::default() };
+            }
+            Event::Retuned { sensor } | Event::Opened { sensor, .. } | Event::Closed { sensor } => {
+                self.sensors[sensor] = PortOfSensor::default();
+            }
+            Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
+                let of = &mut self.sensors[sensor];
+                (of.reads_since, of.is_overdue) = (None, false);
+            }
+            Event::Read { sensor, .. } if self.sensors[sensor].is_altered => {
+                let of = &mut self.sensors[sensor];
+                if of.is_overdue {
+                    say.broken(format!("sensor {sensor}: the rate of another process stays"));
+                    of.is_altered = false;
+                }
+                // The hub acts after the read, not before it.
+                of.is_overdue = at > *of.reads_since.get_or_insert(at) + LIMIT;
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Time for which bytes may arrive at the wrong rate.
+const LIMIT: Nanos = 1_000 * MILLIS;
+
+/// Judge: no request of the hub writes the EEPROM of a scanner. It checks the end of the world.
+pub(crate) struct Eeprom;
+
+impl Judge for Eeprom {
+    fn name(&self) -> &'static str {
+        "eeprom"
+    }
+
+    fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        if let Event::Over { eeprom_writes, .. } = *event
+            && eeprom_writes > 0
+        {
+            say.broken(format!("sensors heard {eeprom_writes} requests that write the EEPROM"));
+        }
+    }
+}
