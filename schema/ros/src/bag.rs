@@ -1,4 +1,4 @@
-//! Messages of ROS 2 in an MCAP file, as rosbag2 stores them: profile `ros2`, each channel with the text of its type and the
+//! Writes ROS messages to an MCAP file as rosbag2 does: profile `ros2`, each channel with the definition of its type and the
 //! quality of service that its publisher offers.
 
 use std::io::{self, Write};
@@ -7,11 +7,11 @@ use scanhub_schema::file::{Foreign, Writer};
 use scanhub_schema::{Header, Pose, Scan};
 
 use crate::{
-    LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, points_topic, scan_cloud,
-    scan_topic, static_transforms,
+    LASER_SCAN, Names, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_cloud, scan_topic,
+    static_transforms,
 };
 
-/// The profile of a file that has only messages of ROS 2.
+/// Profile of a file that has only ROS messages.
 pub const PROFILE: &str = "ros2";
 
 /// Channels and transforms of a file.
@@ -29,7 +29,7 @@ pub struct Bag {
 #[derive(Clone, Copy, Debug)]
 struct Transforms {
     channel: u16,
-    /// Number and time of the next message at the earliest: the last one by time is the one that knows most.
+    /// Number and minimum time of the next message. The latest message must be the one with the most poses.
     number: u32,
     from_ns: u64,
 }
@@ -39,7 +39,7 @@ impl Bag {
     ///
     /// # Errors
     ///
-    /// If the file cannot be written.
+    /// Returns the writer's error.
     pub fn scan<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
@@ -55,7 +55,7 @@ impl Bag {
     ///
     /// # Errors
     ///
-    /// If the file cannot be written.
+    /// Returns the writer's error.
     pub fn points<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
@@ -64,7 +64,7 @@ impl Bag {
         scan: &Scan,
     ) -> io::Result<()> {
         let write = |message: &mut Vec<u8>| scan_cloud(message, frame(sensor), header, scan);
-        self.write(writer, points_topic(sensor), &POINT_CLOUD, header, write)
+        self.write(writer, Names::default().topic(sensor, "points"), &POINT_CLOUD, header, write)
     }
 
     fn write<W: Write>(
@@ -88,8 +88,8 @@ impl Bag {
         writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
     }
 
-    /// Writes the poses of all known sensors if `pose` of `sensor` is new; log time and stamp are `wall_ns` (since 1970), or
-    /// just after the message before.
+    /// Writes the poses of all known sensors if `pose` of `sensor` is new. Log time and stamp are `wall_ns` (since 1970), or just
+    /// after the previous message.
     pub fn pose<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
@@ -129,39 +129,23 @@ fn channel<W: Write>(writer: &mut Writer<W>, topic: &str, of: &Type, offered: &s
     })
 }
 
-/// Keep the last 5, reliable, volatile: whoever plays the file offers that, and every subscriber takes it.
-const EVERY_SCAN: &str = "\
-- history: 1
-  depth: 5
-  reliability: 1
-  durability: 2
-  deadline:
-    sec: 9223372036
-    nsec: 854775807
-  lifespan:
-    sec: 9223372036
-    nsec: 854775807
-  liveliness: 1
-  liveliness_lease_duration:
-    sec: 9223372036
-    nsec: 854775807
-  avoid_ros_namespace_conventions: false
-";
-/// Keep the last one, reliable, transient local: listeners to transforms ask for that.
-const LATCHED: &str = "\
-- history: 1
-  depth: 1
-  reliability: 1
-  durability: 1
-  deadline:
-    sec: 9223372036
-    nsec: 854775807
-  lifespan:
-    sec: 9223372036
-    nsec: 854775807
-  liveliness: 1
-  liveliness_lease_duration:
-    sec: 9223372036
-    nsec: 854775807
-  avoid_ros_namespace_conventions: false
-";
+/// Quality of service: keep the last `depth`, reliable, volatile (2) or transient local (1).
+macro_rules! offered {
+    ($depth:literal, $durability:literal) => {
+        concat!(
+            "- history: 1\n  depth: ",
+            $depth,
+            "\n  reliability: 1\n  durability: ",
+            $durability,
+            "\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n",
+            "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n",
+            "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n",
+            "  avoid_ros_namespace_conventions: false\n"
+        )
+    };
+}
+
+/// A player offers this quality of service, and it is compatible with every subscriber.
+const EVERY_SCAN: &str = offered!(5, 2);
+/// Subscribers to transforms request this quality of service.
+const LATCHED: &str = offered!(1, 1);

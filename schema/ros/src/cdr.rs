@@ -1,5 +1,7 @@
-//! Little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from the start of the body. Refuses to
-//! know types.
+//! Writes and reads messages in little-endian CDR (OMG XCDR1): values in order, each at a multiple of its size from the start
+//! of the body.
+
+use crate::types::{Field, Layout, Type};
 
 /// Writes a message.
 pub(crate) struct Cdr<'a> {
@@ -8,7 +10,7 @@ pub(crate) struct Cdr<'a> {
 }
 
 impl Cdr<'_> {
-    /// Begins a message at the end of `message`.
+    /// Starts a message at the end of `message`.
     pub(crate) fn begin(message: &mut Vec<u8>) -> Cdr<'_> {
         // Plain CDR, little-endian, no options.
         message.extend([0, 1, 0, 0]);
@@ -42,18 +44,18 @@ impl Cdr<'_> {
         self.message.push(0);
     }
 
-    /// As many values as there are, behind their number.
+    /// Writes a sequence: the number of `values`, then the values.
     pub(crate) fn floats(&mut self, values: impl ExactSizeIterator<Item = f32>) {
         self.u32(values.len() as u32);
         values.for_each(|value| self.message.extend(value.to_le_bytes()));
     }
 
-    /// Bytes of an array whose number is told already.
+    /// Writes bytes of a sequence whose length is already written.
     pub(crate) fn bytes(&mut self, bytes: &[u8]) {
         self.message.extend(bytes);
     }
 
-    /// `std_msgs/Header`. Seconds are an int32: from 2038 on they are cut.
+    /// Writes a `std_msgs/Header`. Its seconds are an int32, which overflows in 2038.
     pub(crate) fn header(&mut self, stamp_ns: u64, frame: &str) {
         self.u32((stamp_ns / SECOND_NS) as u32);
         self.u32((stamp_ns % SECOND_NS) as u32);
@@ -67,6 +69,118 @@ impl Cdr<'_> {
     }
 }
 
+/// A value of a message.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value {
+    /// A number or a boolean.
+    Number(f64),
+    /// A text.
+    Text(String),
+    /// A sequence.
+    Sequence(Vec<Value>),
+    /// Fields with their names.
+    Message(Vec<(String, Value)>),
+}
+
+impl Value {
+    /// Returns the value at `path`: names of fields and indices of sequences, separated by dots, such as
+    /// `transforms.0.header`.
+    pub fn at(&self, path: &str) -> Option<&Value> {
+        path.split('.').try_fold(self, |value, step| match value {
+            Value::Message(fields) => fields.iter().find(|(name, _)| name == step).map(|(_, value)| value),
+            Value::Sequence(values) => values.get(step.parse::<usize>().ok()?),
+            Value::Number(_) | Value::Text(_) => None,
+        })
+    }
+
+    /// Returns the number at `path`.
+    pub fn number(&self, path: &str) -> Option<f64> {
+        match self.at(path)? {
+            Value::Number(number) => Some(*number),
+            _ => None,
+        }
+    }
+
+    /// Returns the text at `path`.
+    pub fn text(&self, path: &str) -> Option<&str> {
+        match self.at(path)? {
+            Value::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// Returns the sequence at `path`.
+    pub fn sequence(&self, path: &str) -> Option<&[Value]> {
+        match self.at(path)? {
+            Value::Sequence(values) => Some(values),
+            _ => None,
+        }
+    }
+}
+
+/// Returns the value of `message`, which has type `of`. `None` if it has fewer or more bytes than the type.
+pub fn read(of: &Type, message: &[u8]) -> Option<Value> {
+    let body = message.strip_prefix(&[0, 1, 0, 0])?;
+    let layout = Layout::of(of);
+    let mut reader = Reader { layout: &layout, body, at: 0 };
+    let value = reader.fields(layout.fields(of.name)?)?;
+    (reader.at == body.len()).then_some(value)
+}
+
+/// A position in a message.
+struct Reader<'a> {
+    layout: &'a Layout<'a>,
+    body: &'a [u8],
+    at: usize,
+}
+
+impl Reader<'_> {
+    fn fields(&mut self, fields: &[Field<'_>]) -> Option<Value> {
+        let values = fields.iter().map(|field| Some((field.name.to_owned(), self.field(field)?)));
+        values.collect::<Option<_>>().map(Value::Message)
+    }
+
+    fn field(&mut self, field: &Field<'_>) -> Option<Value> {
+        if !field.is_sequence {
+            return self.one(field.of);
+        }
+        let count = self.count()?;
+        (0..count).map(|_| self.one(field.of)).collect::<Option<_>>().map(Value::Sequence)
+    }
+
+    fn one(&mut self, of: &str) -> Option<Value> {
+        Some(Value::Number(match of {
+            "bool" | "byte" | "uint8" => u8::from_le_bytes(self.take()?).into(),
+            "int32" => i32::from_le_bytes(self.take()?).into(),
+            "uint32" => u32::from_le_bytes(self.take()?).into(),
+            "float32" => f32::from_le_bytes(self.take()?).into(),
+            "float64" => f64::from_le_bytes(self.take()?),
+            "string" => return self.text().map(Value::Text),
+            name => return self.fields(self.layout.fields(name)?),
+        }))
+    }
+
+    fn text(&mut self) -> Option<String> {
+        let bytes = self.count()?;
+        let text = self.body.get(self.at..self.at + bytes)?;
+        self.at += bytes;
+        String::from_utf8(text.strip_suffix(&[0])?.to_vec()).ok()
+    }
+
+    /// Reads the number of values that follow. Each has at least one byte.
+    fn count(&mut self) -> Option<usize> {
+        let count = u32::from_le_bytes(self.take()?) as usize;
+        (count <= self.body.len() - self.at).then_some(count)
+    }
+
+    fn take<const SIZE: usize>(&mut self) -> Option<[u8; SIZE]> {
+        let begin = self.at.next_multiple_of(SIZE);
+        let bytes = self.body.get(begin..begin + SIZE)?;
+        self.at = begin + SIZE;
+        bytes.try_into().ok()
+    }
+}
+
 const SECOND_NS: u64 = 1_000_000_000;
 
 #[cfg(test)]
@@ -75,7 +189,7 @@ mod tests {
 
     #[test]
     fn values_stand_at_multiples_of_their_size() {
-        // What is there already does not count.
+        // Bytes before the message do not count.
         let mut message = vec![9; 3];
         let mut cdr = Cdr::begin(&mut message);
         cdr.text("ab");

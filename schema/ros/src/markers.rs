@@ -1,55 +1,48 @@
-//! Circles, reflectors and people as `visualization_msgs/msg/MarkerArray`. Refuses to know how they are found.
+//! Objects that a viewer draws: zones, marks and people as `visualization_msgs/msg/MarkerArray`, and people as
+//! `geometry_msgs/msg/PoseArray`.
 
-use scanhub_schema::{Header, Marks, TrackState, Tracks, Verdict, Zones};
+use scanhub_schema::{Header, Marks, Track, TrackState, Tracks, Verdict, Zones};
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 
-/// Writes the circles of `zones` to the end of `message`: thin discs around the robot's centre, the largest lowest; red
-/// where something is inside, else green, all of them grey if the verdict is unknown. Who draws them removes them a second
-/// after the last message.
+/// Appends `zones` to `message` as a MarkerArray: thin discs around the robot's center, the largest one lowest. They are red
+/// if something is inside and otherwise green. All of them are gray if the verdict is unknown. A viewer removes them one
+/// second after the last message.
 pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(zones.zones().len() as u32);
-    for (place, zone) in zones.zones().iter().enumerate() {
+    for (index, zone) in zones.zones().iter().enumerate() {
         let color = match (zones.verdict(), zone.violated) {
-            (Verdict::Unknown, 0) => GREY,
+            (Verdict::Unknown, 0) => GRAY,
             (_, 0) => GREEN,
             _ => RED,
         };
-        let across = f64::from(zone.radius_mm) / 500.0;
+        let diameter = f64::from(zone.radius_mm) / 500.0;
         let shape = Shape {
-            stamp_ns: header.wall_ns,
-            frame: BASE_FRAME,
-            name: "zones",
-            number: place as u32,
-            kind: CYLINDER,
-            action: ADD,
-            place: [0.0, 0.0, DISC * place as f64],
-            scale: [across, across, DISC],
+            namespace: "zones",
+            id: index as u32,
+            position: [0.0, 0.0, DISC * index as f64],
+            scale: [diameter, diameter, DISC],
             color,
-            text: "",
+            ..Shape::new(header, BASE_FRAME)
         };
         shape.write(&mut cdr, [].into_iter());
     }
 }
 
-/// Writes `marks` of the frame `frame` to the end of `message`: one list of spheres, each where its mark was seen; removed
-/// if there are none. Who draws them removes them a second after the last message.
+/// Appends `marks` in frame `frame` to `message` as a MarkerArray: one list of spheres, or its removal if there are no marks.
+/// A viewer removes them one second after the last message.
 pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: &Marks) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(1);
     let shape = Shape {
-        stamp_ns: header.wall_ns,
-        frame,
-        name: "marks",
-        number: 0,
+        namespace: "marks",
         kind: SPHERE_LIST,
         action: if marks.marks().is_empty() { DELETE } else { ADD },
-        place: [0.0; 3],
         scale: [SPHERE; 3],
         color: YELLOW,
-        text: "",
+        ..Shape::new(header, frame)
     };
     let points = marks.marks().iter().map(|mark| {
         let (sin, cos) = (f64::from(mark.angle_mdeg) / 1000.0).to_radians().sin_cos();
@@ -58,80 +51,109 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
     shape.write(&mut cdr, points);
 }
 
-/// Writes the people of `tracks`, in the map called `frame`, to the end of `message`: for each one who is known a column and above
-/// it the number; grey who is not seen now. Who draws them removes them a second after the last message.
+/// Appends the people of `tracks` in the map `frame` to `message` as a MarkerArray: a column for each track that is not
+/// tentative, with its ID above, gray if the person is not seen now. A viewer removes them one second after the last message.
 pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
-    let known = || tracks.tracks().iter().filter(|track| track.state() != TrackState::Tentative);
     let mut cdr = Cdr::begin(message);
-    cdr.u32(2 * known().count() as u32);
-    for track in known() {
-        let number = track.id.to_string();
+    cdr.u32(2 * known(tracks).count() as u32);
+    for track in known(tracks) {
+        let id = track.id.to_string();
         let at = |z: f64| [track.x_m.into(), track.y_m.into(), z];
         let column = Shape {
-            stamp_ns: header.wall_ns,
-            frame,
-            name: "people",
-            // Markers are told apart by an int32.
-            number: (track.id & 0x7FFF_FFFF) as u32,
-            kind: CYLINDER,
-            action: ADD,
-            place: at(PERSON / 2.0),
+            namespace: "people",
+            // The ID of a marker is an int32.
+            id: (track.id & 0x7FFF_FFFF) as u32,
+            position: at(PERSON / 2.0),
             scale: [SHOULDERS, SHOULDERS, PERSON],
-            color: if track.state() == TrackState::Confirmed { BLUE } else { GREY },
-            text: "",
+            color: if track.state() == TrackState::Confirmed { BLUE } else { GRAY },
+            ..Shape::new(header, frame)
         };
         column.write(&mut cdr, [].into_iter());
-        let words = Shape {
-            name: "numbers",
-            kind: WORDS,
-            place: at(PERSON + LETTERS),
+        let label = Shape {
+            namespace: "numbers",
+            kind: TEXT,
+            position: at(PERSON + LETTERS),
             scale: [0.0, 0.0, LETTERS],
             color: WHITE,
-            text: &number,
+            text: &id,
             ..column
         };
-        words.write(&mut cdr, [].into_iter());
+        label.write(&mut cdr, [].into_iter());
     }
 }
 
-/// What is drawn: `visualization_msgs/msg/Marker` without what only other shapes have.
+/// Appends the people of `tracks` in the map `frame` to `message` as a PoseArray: a pose for each track that is not tentative.
+/// Its direction is that in which the person walks, or the x axis if the person stands.
+pub fn people_poses(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
+    let mut cdr = Cdr::begin(message);
+    cdr.header(header.wall_ns, frame);
+    cdr.u32(known(tracks).count() as u32);
+    for track in known(tracks) {
+        let [x, y, vx, vy] = [track.x_m, track.y_m, track.vx_m_s, track.vy_m_s].map(f64::from);
+        let walks = vx.hypot(vy) >= WALKING_M_S;
+        let (sin, cos) = if walks { (vy.atan2(vx) / 2.0).sin_cos() } else { (0.0, 1.0) };
+        [x, y, 0.0, 0.0, 0.0, sin, cos].into_iter().for_each(|value| cdr.f64(value));
+    }
+}
+
+/// Returns the tracks that are not tentative.
+fn known(tracks: &Tracks) -> impl Iterator<Item = &Track> {
+    tracks.tracks().iter().filter(|track| track.state() != TrackState::Tentative)
+}
+
+/// A `visualization_msgs/msg/Marker`, without the fields that only other shapes have.
 struct Shape<'a> {
     stamp_ns: u64,
     frame: &'a str,
-    name: &'a str,
-    number: u32,
+    namespace: &'a str,
+    id: u32,
     kind: u32,
     action: u32,
-    /// x, y and z of its centre in metres.
-    place: [f64; 3],
+    /// x, y and z of the center in meters.
+    position: [f64; 3],
     scale: [f64; 3],
     color: [f32; 4],
-    /// What it says, if it is words.
+    /// Text of a shape of kind [`TEXT`].
     text: &'a str,
 }
 
-impl Shape<'_> {
+impl<'a> Shape<'a> {
+    /// Returns a cylinder with the stamp of `header`.
+    fn new(header: &Header, frame: &'a str) -> Shape<'a> {
+        Shape {
+            stamp_ns: header.wall_ns,
+            frame,
+            namespace: "",
+            id: 0,
+            kind: CYLINDER,
+            action: ADD,
+            position: [0.0; 3],
+            scale: [0.0; 3],
+            color: WHITE,
+            text: "",
+        }
+    }
+
     fn write(&self, cdr: &mut Cdr<'_>, points: impl ExactSizeIterator<Item = [f64; 2]>) {
         cdr.header(self.stamp_ns, self.frame);
-        cdr.text(self.name);
-        [self.number, self.kind, self.action].into_iter().for_each(|value| cdr.u32(value));
-        // Where it is, not turned, how large.
-        let whither = [0.0, 0.0, 0.0, 1.0];
-        self.place.into_iter().chain(whither).chain(self.scale).for_each(|value| cdr.f64(value));
+        cdr.text(self.namespace);
+        [self.id, self.kind, self.action].into_iter().for_each(|value| cdr.u32(value));
+        let orientation = [0.0, 0.0, 0.0, 1.0];
+        self.position.into_iter().chain(orientation).chain(self.scale).for_each(|value| cdr.f64(value));
         self.color.into_iter().for_each(|value| cdr.f32(value));
-        // How long it is drawn, in seconds and nanoseconds.
+        // Lifetime in seconds and nanoseconds.
         [1, 0].into_iter().for_each(|value| cdr.u32(value));
         cdr.bool(false);
         cdr.u32(points.len() as u32);
         points.for_each(|[x, y]| [x, y, 0.0].into_iter().for_each(|axis| cdr.f64(axis)));
-        // No colours of its own for each point; no texture: its name, its picture with frame, stamp and format, its corners.
+        // No colors of points, and no texture: its name, its image with header, format and data, its coordinates.
         cdr.u32(0);
         cdr.text("");
         cdr.header(0, "");
         cdr.text("");
         cdr.u32(0);
         cdr.u32(0);
-        // Its words, and no mesh: its name, its file, whether its colours are used.
+        // The text, and no mesh: its name, its file, whether its materials are used.
         cdr.text(self.text);
         cdr.text("");
         cdr.text("");
@@ -142,14 +164,14 @@ impl Shape<'_> {
 
 const CYLINDER: u32 = 3;
 const SPHERE_LIST: u32 = 7;
-const WORDS: u32 = 9;
+const TEXT: u32 = 9;
 const ADD: u32 = 0;
 const DELETE: u32 = 2;
-/// Metres.
+/// Height of a disc in meters.
 const DISC: f64 = 0.01;
-/// Metres across.
+/// Diameter of a mark in meters.
 const SPHERE: f64 = 0.1;
-/// Metres: how tall a person is drawn, how broad, and the number above.
+/// Height and diameter of a person, and height of the ID above, in meters.
 const PERSON: f64 = 1.7;
 const SHOULDERS: f64 = 0.4;
 const LETTERS: f64 = 0.3;
@@ -157,15 +179,17 @@ const BLUE: [f32; 4] = [0.1, 0.4, 0.9, 0.8];
 const WHITE: [f32; 4] = [1.0; 4];
 const GREEN: [f32; 4] = [0.1, 0.7, 0.2, 0.25];
 const RED: [f32; 4] = [0.9, 0.1, 0.1, 0.4];
-const GREY: [f32; 4] = [0.5, 0.5, 0.5, 0.25];
+const GRAY: [f32; 4] = [0.5, 0.5, 0.5, 0.25];
 const YELLOW: [f32; 4] = [1.0, 0.8, 0.0, 1.0];
+/// Minimum speed of a person who walks.
+const WALKING_M_S: f64 = 0.2;
 
 #[cfg(test)]
 mod tests {
     use scanhub_schema::{Mark, Track, Zone};
 
     use super::*;
-    use crate::{MARKER_ARRAY, Value, read};
+    use crate::{MARKER_ARRAY, POSE_ARRAY, Value, read};
 
     fn header() -> Header {
         Header { wall_ns: 3_000_000_005, ..Header::default() }
@@ -197,10 +221,10 @@ mod tests {
         }
         zones.verdict = Verdict::Unknown as u8;
         let told = drawn(&zones);
-        let grey = f64::from(GREY[0]);
+        let gray = f64::from(GRAY[0]);
         assert_eq!(
             (told.number("markers.0.color.r"), told.number("markers.1.color.r")),
-            (Some(RED[0].into()), Some(grey))
+            (Some(RED[0].into()), Some(gray))
         );
     }
 
@@ -246,5 +270,29 @@ mod tests {
             assert_eq!(told.text(&format!("markers.{place}.text")), Some(text));
             assert_eq!(told.text(&format!("markers.{place}.header.frame_id")), Some("house"));
         }
+    }
+
+    #[test]
+    fn poses_of_people_have_the_direction_in_which_they_walk() {
+        let mut tracks = Tracks::default();
+        for (state, vy_m_s) in [(1, 1.0), (0, 1.0), (2, 0.1)] {
+            tracks.push(Track { x_m: 2.0, y_m: -0.5, vy_m_s, state, ..Track::default() });
+        }
+        let mut message = Vec::new();
+        people_poses(&mut message, "house", &header(), &tracks);
+        let told = read(&POSE_ARRAY, &message).unwrap();
+        assert_eq!(told.sequence("poses").map(<[Value]>::len), Some(2), "nobody who is tentative");
+        assert_eq!(told.text("header.frame_id"), Some("house"));
+        assert_eq!(
+            (told.number("poses.0.position.x"), told.number("poses.0.position.y")),
+            (Some(2.0), Some(-0.5))
+        );
+        // A quarter turn to the left.
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        for axis in ["z", "w"] {
+            let value = told.number(&format!("poses.0.orientation.{axis}")).unwrap();
+            assert!((value - half).abs() < 1e-12, "{axis}: {value}");
+        }
+        assert_eq!(told.number("poses.1.orientation.w"), Some(1.0));
     }
 }

@@ -1,47 +1,46 @@
-//! Names of topics and frames. Refuses to know messages.
+//! Names of topics and frames, and the transforms between frames.
 
-/// The topic of [`static_transforms`](crate::static_transforms).
+use scanhub_schema::Pose;
+
+use crate::cdr::Cdr;
+
+/// Topic of [`static_transforms`].
 pub const TF_STATIC: &str = "/tf_static";
 
-/// The topic of [`diagnosis`](crate::diagnosis).
+/// Topic of [`diagnosis`](crate::diagnosis).
 pub const DIAGNOSTICS: &str = "/diagnostics";
 
-/// The frame of the robot, in which poses are given (REP 105).
+/// Frame of the robot, in which poses are given (REP 105).
 pub const BASE_FRAME: &str = "base_link";
 
-/// The frame in which `sensor` measures: its name.
+/// Returns the default name of the frame in which `sensor` measures.
 pub fn frame(sensor: &str) -> &str {
     sensor
 }
 
-/// The topic of `sensor`'s scans, where nothing else is said. A sensor of another machine has its own namespace.
+/// Returns the topic of `sensor`'s scans, with the default [`Names`]. A remote sensor has its own namespace.
 pub fn scan_topic(sensor: &str) -> String {
     Names::default().topic(sensor, "scan")
 }
 
-/// Returns the topic of `sensor`'s scans as points, with the default [`Names`].
-pub fn points_topic(sensor: &str) -> String {
-    Names::default().topic(sensor, "points")
-}
-
-/// How topics and frames are called.
+/// Names of topics and frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Names {
-    /// Before every topic: words, each behind a slash; empty: none.
+    /// Start of every topic: empty, or names that each follow a slash.
     namespace: String,
-    /// The same, behind the namespace and before the topics of sensors.
+    /// The part between the namespace and the topics of sensors, in the same form.
     prefix: String,
-    /// Sensors that have another frame than one with their name.
+    /// Frames by sensor, for sensors whose frame does not have their name.
     frames: Vec<(String, String)>,
 }
 
 impl Names {
-    /// Makes names with `namespace` before every topic, behind it `prefix` before those of sensors, and a frame for each
-    /// sensor in `frames`. Words are separated by slashes; one before the first may be left out.
+    /// Creates names with `namespace` at the start of every topic, `prefix` after it in topics of sensors, and a frame for each
+    /// sensor in `frames`. The slash before the first name is optional.
     ///
     /// # Errors
     ///
-    /// The name that ROS does not take (<https://design.ros2.org/articles/topic_and_service_names.html>).
+    /// Returns the name that is not valid in ROS (<https://design.ros2.org/articles/topic_and_service_names.html>).
     pub fn new(namespace: &str, prefix: &str, frames: Vec<(String, String)>) -> Result<Names, String> {
         if let Some((_, bad)) = frames.iter().find(|(_, frame)| frame.is_empty() || words(frame).is_none()) {
             return Err(bad.clone());
@@ -50,12 +49,12 @@ impl Names {
         Ok(Names { namespace: path(namespace)?, prefix: path(prefix)?, frames })
     }
 
-    /// Returns the namespace: words, each behind a slash; empty: none.
+    /// Returns the namespace: empty, or names that each follow a slash.
     pub fn namespace(&self) -> &str {
         &self.namespace
     }
 
-    /// Returns the topic `word` of `sensor`: letters, digits and `_` in words that do not start with a digit.
+    /// Returns the topic `word` of `sensor`. Its names have letters, digits and `_`, and do not start with a digit.
     pub fn topic(&self, sensor: &str, word: &str) -> String {
         let mut topic = [self.namespace(), &self.prefix].concat();
         for part in sensor.split('.') {
@@ -73,7 +72,7 @@ impl Names {
         [self.namespace(), name].concat()
     }
 
-    /// Returns the sensors to which a frame was given.
+    /// Returns the sensors that were given a frame.
     pub fn framed(&self) -> impl Iterator<Item = &str> {
         self.frames.iter().map(|(sensor, _)| &**sensor)
     }
@@ -84,7 +83,30 @@ impl Names {
     }
 }
 
-/// `text` with a slash before each of its words; nothing if ROS does not take one of them.
+/// Appends the `poses` of the sensors on the robot, by their frames, to `message` as `tf2_msgs/msg/TFMessage`, with the stamp
+/// `stamp_ns` (since 1970). Pass all of them, because a late joiner gets only the last message of the topic.
+///
+/// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's z.
+/// The angles of its scans then run in the other direction.
+pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String, Pose)]) {
+    let mut cdr = Cdr::begin(message);
+    cdr.u32(poses.len() as u32);
+    for (frame, pose) in poses {
+        cdr.header(stamp_ns, BASE_FRAME);
+        cdr.text(frame);
+        for value in [pose.x_m, pose.y_m, 0.0].into_iter().chain(rotation(pose)) {
+            cdr.f64(value);
+        }
+    }
+}
+
+/// Returns the quaternion x, y, z, w that rotates a direction in the sensor's frame into the robot's.
+fn rotation(pose: &Pose) -> [f64; 4] {
+    let (sin, cos) = (pose.yaw_rad / 2.0).sin_cos();
+    if pose.upside_down == 0 { [0.0, 0.0, sin, cos] } else { [cos, sin, 0.0, 0.0] }
+}
+
+/// Returns `text` with a slash before each of its names; `None` if one of them is not valid in ROS.
 fn words(text: &str) -> Option<String> {
     let text = text.strip_prefix('/').unwrap_or(text);
     if text.is_empty() {
@@ -122,5 +144,45 @@ mod tests {
             assert_eq!(Names::new("", bad, Vec::new()), Err(bad.to_owned()));
             assert!(Names::new("", "", vec![("front".to_owned(), bad.to_owned())]).is_err());
         }
+    }
+
+    /// Returns `v` rotated by the quaternion: v + 2 u x (u x v + w v).
+    fn turned([x, y, z, w]: [f64; 4], v: [f64; 3]) -> [f64; 3] {
+        let cross = |a: [f64; 3], b: [f64; 3]| {
+            [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        };
+        let u = [x, y, z];
+        let inner = cross(u, v);
+        let outer = cross(u, std::array::from_fn(|i| inner[i] + w * v[i]));
+        std::array::from_fn(|i| v[i] + 2.0 * outer[i])
+    }
+
+    #[test]
+    fn a_beam_points_where_its_pose_says() {
+        for (yaw_rad, upside_down) in [(0.0, 0), (0.7, 0), (2.9, 1), (-1.2, 1), (0.0, 1)] {
+            let pose = Pose { yaw_rad, upside_down, ..Pose::default() };
+            for angle_deg in [-90.0_f64, -60.0, 0.0, 55.0, 90.0] {
+                let (sin, cos) = angle_deg.to_radians().sin_cos();
+                let [x, y, z] = turned(rotation(&pose), [cos, sin, 0.0]);
+                let (wanted_x, wanted_y) = pose.direction(angle_deg.to_radians());
+                let apart = (x - wanted_x).abs() + (y - wanted_y).abs() + z.abs();
+                assert!(apart < 1e-12, "{pose:?} {angle_deg}: {x} {y} {z}, not {wanted_x} {wanted_y}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_message_has_all_sensors() {
+        let front = Pose { x_m: 0.5, ..Pose::default() };
+        let poses = [("front".to_owned(), front), ("rear".to_owned(), Pose::default())];
+        let mut message = Vec::new();
+        static_transforms(&mut message, 1_700_000_000_000_000_007, &poses);
+        assert_eq!(message[4..8], [2, 0, 0, 0]);
+        assert_eq!(message[8..12], 1_700_000_000_u32.to_le_bytes());
+        assert_eq!(message[12..16], [7, 0, 0, 0]);
+        // Stamp, two texts with their ends, up to a multiple of eight: seven numbers.
+        let x = 4 + (4 + 8 + 4 + 12 + 4 + 6_usize).next_multiple_of(8);
+        assert_eq!(message[x..x + 8], 0.5f64.to_le_bytes());
+        assert!(message[x + 56..].windows(5).any(|some| some == b"rear\0"));
     }
 }

@@ -1,32 +1,47 @@
-//! The types of the messages: their names and their texts. Refuses to know values.
+//! Types of ROS messages: their names, their definitions in the language `ros2msg`, and the hashes by which ROS 2
+//! distinguishes types on the wire.
 
-/// A type of messages.
+use std::fmt::Write;
+
+use sha2::{Digest, Sha256};
+
+/// Type of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Type {
-    /// Its name, such as `sensor_msgs/msg/LaserScan`.
+    /// Name, such as `sensor_msgs/msg/LaserScan`.
     pub name: &'static str,
-    /// Its fields, in the language `ros2msg`; the types that it contains follow, each after a line, as rosbag2 stores them.
+    /// Definition in the language `ros2msg`, as rosbag2 stores it: the fields, then the types that it contains, each after a
+    /// separator.
     pub text: &'static str,
 }
 
 impl Type {
-    /// How messages are encoded: little-endian CDR (OMG XCDR1).
+    /// Encoding of messages: little-endian CDR (OMG XCDR1).
     pub const ENCODING: &str = "cdr";
-    /// The language of [`Type::text`].
+    /// Language of [`Type::text`].
     pub const LANGUAGE: &str = "ros2msg";
-    /// Stands between two types in [`Type::text`].
-    pub(crate) const LINE: &str =
+    /// Separator between two types in [`Type::text`].
+    const LINE: &str =
         "================================================================================\nMSG: ";
+
+    /// Returns the type's hash: SHA-256 of its description in JSON (REP 2016, `rosidl`), such as `RIHS01_64c1..`, with 64 hex
+    /// digits after the version.
+    pub fn hash(&self) -> String {
+        Sha256::digest(description(&Layout::of(self))).iter().fold(PREFIX.to_owned(), |mut hash, byte| {
+            let _ = write!(hash, "{byte:02x}");
+            hash
+        })
+    }
 }
 
-/// The text of a type: its own fields, then each type that it contains, once.
+/// Definition of a type: its own fields, then each type that it contains, once.
 macro_rules! text {
     ($($field:literal)+ $(; $($of:ident)+)?) => {
         concat!($($field, "\n",)+ $($(contained!($of),)+)?)
     };
 }
 
-/// A contained type, behind its line.
+/// A contained type, after the separator.
 macro_rules! contained {
     (Header) => { contained!("std_msgs/Header": "builtin_interfaces/Time stamp" "string frame_id") };
     (Time) => { contained!("builtin_interfaces/Time": "int32 sec" "uint32 nanosec") };
@@ -81,7 +96,7 @@ macro_rules! contained {
     };
 }
 
-/// A scan.
+/// Type of a scan.
 pub const LASER_SCAN: Type = Type {
     name: "sensor_msgs/msg/LaserScan",
     text: text!(
@@ -91,7 +106,7 @@ pub const LASER_SCAN: Type = Type {
     ),
 };
 
-/// Points.
+/// Type of points.
 pub const POINT_CLOUD: Type = Type {
     name: "sensor_msgs/msg/PointCloud2",
     text: text!(
@@ -100,7 +115,7 @@ pub const POINT_CLOUD: Type = Type {
     ),
 };
 
-/// Shapes to be drawn.
+/// Type of shapes that a viewer draws.
 pub const MARKER_ARRAY: Type = Type {
     name: "visualization_msgs/msg/MarkerArray",
     text: text!(
@@ -109,16 +124,16 @@ pub const MARKER_ARRAY: Type = Type {
     ),
 };
 
-/// Places with directions.
+/// Type of poses.
 pub const POSE_ARRAY: Type = Type {
     name: "geometry_msgs/msg/PoseArray",
     text: text!("std_msgs/Header header" "geometry_msgs/Pose[] poses"; Header Time Pose Point Quaternion),
 };
 
-/// A word.
+/// Type of a text.
 pub const STRING: Type = Type { name: "std_msgs/msg/String", text: text!("string data") };
 
-/// How parts of the robot are.
+/// Type of diagnostics.
 pub const DIAGNOSTIC_ARRAY: Type = Type {
     name: "diagnostic_msgs/msg/DiagnosticArray",
     text: text!(
@@ -126,10 +141,145 @@ pub const DIAGNOSTIC_ARRAY: Type = Type {
     ),
 };
 
-/// Where frames are in others.
+/// Type of transforms between frames.
 pub const TF_MESSAGE: Type = Type {
     name: "tf2_msgs/msg/TFMessage",
     text: text!(
         "geometry_msgs/TransformStamped[] transforms"; TransformStamped Header Time Transform Vector3 Quaternion
     ),
 };
+
+/// A parsed definition: a type and those that it contains.
+#[derive(Clone, Debug)]
+pub(crate) struct Layout<'a> {
+    /// Types by name, first the type itself. The names of the others have no `msg`, such as `std_msgs/Header`.
+    types: Vec<(&'a str, Vec<Field<'a>>)>,
+}
+
+/// A field of a type.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Field<'a> {
+    pub(crate) name: &'a str,
+    /// Name of a primitive type or of a contained type.
+    pub(crate) of: &'a str,
+    /// Whether it is a sequence of any length.
+    pub(crate) is_sequence: bool,
+}
+
+impl<'a> Layout<'a> {
+    /// Parses the definition of `of`. The names of contained types must include the package.
+    pub(crate) fn of(of: &'a Type) -> Layout<'a> {
+        let types = of.text.split(Type::LINE).enumerate().map(|(place, text)| {
+            let (name, fields) =
+                if place == 0 { (of.name, text) } else { text.split_once('\n').unwrap_or((text, "")) };
+            (name, fields.lines().filter_map(field).collect())
+        });
+        Layout { types: types.collect() }
+    }
+
+    /// Returns the fields of the type `name`; `None` for a primitive type.
+    pub(crate) fn fields(&self, name: &str) -> Option<&[Field<'a>]> {
+        self.types.iter().find(|(of, _)| *of == name).map(|(_, fields)| &fields[..])
+    }
+}
+
+/// Parses a line: type, name, and perhaps a default, which is not part of messages.
+fn field(line: &str) -> Option<Field<'_>> {
+    let mut words = line.split_whitespace();
+    let (of, name) = (words.next()?, words.next()?);
+    let single = of.strip_suffix("[]");
+    Some(Field { name, of: single.unwrap_or(of), is_sequence: single.is_some() })
+}
+
+/// Returns the description of the type and of those that it contains, sorted by name. The spaces are part of the hash.
+fn description(layout: &Layout<'_>) -> String {
+    let mut types: Vec<String> =
+        layout.types.iter().map(|(name, fields)| type_description(name, fields)).collect();
+    let itself = types.remove(0);
+    types.sort_unstable();
+    format!(r#"{{"type_description": {itself}, "referenced_type_descriptions": [{}]}}"#, types.join(", "))
+}
+
+fn type_description(name: &str, fields: &[Field<'_>]) -> String {
+    let fields: Vec<String> = fields.iter().map(field_description).collect();
+    format!(r#"{{"type_name": "{}", "fields": [{}]}}"#, full_name(name), fields.join(", "))
+}
+
+fn field_description(field: &Field<'_>) -> String {
+    let (number, nested) = match number(field.of) {
+        Some(number) => (number, String::new()),
+        None => (NESTED, full_name(field.of)),
+    };
+    let number = if field.is_sequence { number + SEQUENCE } else { number };
+    format!(
+        r#"{{"name": "{}", "type": {{"type_id": {number}, "capacity": 0, "string_capacity": 0, "nested_type_name": "{nested}"}}}}"#,
+        field.name
+    )
+}
+
+/// Returns the full name of a type: `std_msgs/msg/Header` for `std_msgs/Header`.
+fn full_name(name: &str) -> String {
+    match name.split_once('/') {
+        Some((package, rest)) if !rest.starts_with("msg/") => format!("{package}/msg/{rest}"),
+        _ => name.to_owned(),
+    }
+}
+
+/// Returns the number of a primitive type (`type_description_interfaces/msg/FieldType`).
+fn number(word: &str) -> Option<u8> {
+    let words = [
+        ("uint8", 3),
+        ("int32", 6),
+        ("uint32", 7),
+        ("float32", 10),
+        ("float64", 11),
+        ("bool", 15),
+        ("byte", 16),
+        ("string", 17),
+    ];
+    words.into_iter().find(|(of, _)| *of == word).map(|(_, number)| number)
+}
+
+/// Version of the hash.
+const PREFIX: &str = "RIHS01_";
+/// Number of a type that has its own description.
+const NESTED: u8 = 1;
+/// Offset of the number for a sequence of any length.
+const SEQUENCE: u8 = 144;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Hashes that PyPI's `rosbags` 0.11.9 computes for Jazzy, and `zenoh-ros2-sdk` 0.1.8 from the same definitions. Other
+    /// published code has the same hashes, taken from ROS itself.
+    const GOLDEN: [(Type, &str); 7] = [
+        (LASER_SCAN, "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"),
+        (POINT_CLOUD, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),
+        (MARKER_ARRAY, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),
+        (POSE_ARRAY, "af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0"),
+        (STRING, "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+        (DIAGNOSTIC_ARRAY, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
+        (TF_MESSAGE, "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),
+    ];
+
+    #[test]
+    fn hashes_are_those_of_independent_implementations() {
+        for (of, golden) in GOLDEN {
+            assert_eq!(of.hash(), format!("RIHS01_{golden}"), "{}", of.name);
+        }
+    }
+
+    #[test]
+    fn every_contained_type_is_there_once() {
+        for (of, _) in GOLDEN {
+            let layout = Layout::of(&of);
+            let fields = layout.types.iter().flat_map(|(_, fields)| fields);
+            let used: std::collections::BTreeSet<_> =
+                fields.map(|field| field.of).filter(|of| number(of).is_none()).collect();
+            let there: Vec<_> = layout.types.iter().skip(1).map(|(name, _)| *name).collect();
+            assert_eq!(there.len(), used.len(), "{}", of.name);
+            assert!(there.iter().all(|name| used.contains(name)), "{}: {there:?}", of.name);
+        }
+    }
+}

@@ -1,9 +1,9 @@
-//! What ROS 2 over Zenoh (`rmw_zenoh`) expects on the wire, as text and bytes: keys of messages, the tokens by which nodes
-//! and publishers are found, the quality of service, what comes with a message (its docs/design.md, `liveliness_utils.cpp`,
-//! `attachment_helpers.cpp`). Refuses to know Zenoh.
+//! Wire format of ROS 2 over Zenoh (`rmw_zenoh`), as text and bytes: keys of messages, tokens of nodes and publishers, the
+//! quality of service, and attachments of messages. Its sources are docs/design.md, `liveliness_utils.cpp` and
+//! `attachment_helpers.cpp` of `rmw_zenoh`.
 //!
-//! The attachment is that of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. Those before had
-//! names between the values.
+//! The attachment is that of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. Before, it had names
+//! between the values.
 
 use sha2::{Digest, Sha256};
 
@@ -23,10 +23,10 @@ pub enum Distro {
 }
 
 impl Distro {
-    /// All of them.
+    /// All releases.
     pub const ALL: [Distro; 4] = [Distro::Humble, Distro::Jazzy, Distro::Kilted, Distro::Rolling];
 
-    /// Returns its name in lower case.
+    /// Returns the release's name in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Distro::Humble => "humble",
@@ -41,7 +41,7 @@ impl Distro {
         Distro::ALL.into_iter().find(|distro| distro.name() == name)
     }
 
-    /// Returns what it writes in the place of a type's hash.
+    /// Returns the hash of `of`, or the text that the release has in its place.
     pub fn hash(self, of: &Type) -> String {
         match self {
             Distro::Humble => "TypeHashNotSupported".to_owned(),
@@ -50,19 +50,19 @@ impl Distro {
     }
 }
 
-/// What a publisher promises.
+/// Quality of service that a publisher offers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Qos {
     /// Best effort, volatile, keep the last 5: sensor data.
     SensorData,
     /// Reliable, volatile, keep the last one or more.
     Reliable(u8),
-    /// Reliable, transient local, keep the last one: who comes late gets it.
+    /// Reliable, transient local, keep the last one, which late joiners receive.
     Latched,
 }
 
 impl Qos {
-    /// Returns how many messages are kept.
+    /// Returns the number of messages that are kept.
     pub fn depth(self) -> usize {
         match self {
             Qos::SensorData => 5,
@@ -71,8 +71,8 @@ impl Qos {
         }
     }
 
-    /// Returns it as in a token: reliability (2 best effort), durability (1 transient local), history and depth, deadline,
-    /// lifespan, liveliness; nothing where it is the default.
+    /// Returns the text in a token: reliability (2 best effort), durability (1 transient local), history and depth, deadline,
+    /// lifespan, liveliness. Defaults are left out.
     pub fn text(self) -> String {
         match self {
             Qos::SensorData => "2::,5:,:,:,,".to_owned(),
@@ -87,38 +87,38 @@ impl Qos {
 pub struct Node {
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// The session's identity in Zenoh, as Zenoh writes it.
+    /// ID of the session, as Zenoh writes it.
     pub session: String,
-    /// Words between slashes, with a slash before them; empty: none.
+    /// Namespace: empty, or names that each follow a slash.
     pub namespace: String,
     /// Letters, digits and `_`.
     pub name: String,
-    /// The release for whose nodes it is.
+    /// Release of the nodes that it is for.
     pub distro: Distro,
 }
 
 /// A topic with one publisher.
 #[derive(Clone, Debug)]
 pub struct Publisher<'a> {
-    /// Number among what the node has, from 1: 0 is the node's own.
+    /// Number in the node, from 1. The node itself has 0.
     pub number: u32,
     /// Full name, such as `/front/scan`.
     pub topic: &'a str,
-    /// The type of its messages.
+    /// Type of its messages.
     pub of: &'a Type,
-    /// What it promises.
+    /// Quality of service.
     pub qos: Qos,
 }
 
 impl Node {
-    /// Returns the token that says that the node is there.
+    /// Returns the token that announces the node.
     pub fn token(&self) -> String {
         let (domain, session, namespace, name) =
             (self.domain, &self.session, self.mangled_namespace(), &self.name);
         format!("@ros2_lv/{domain}/{session}/0/0/NN/%/{namespace}/{name}")
     }
 
-    /// Returns the token that says that `publisher` is there.
+    /// Returns the token that announces `publisher`.
     pub fn publisher_token(&self, publisher: &Publisher<'_>) -> String {
         let (domain, session, namespace, name) =
             (self.domain, &self.session, self.mangled_namespace(), &self.name);
@@ -133,14 +133,14 @@ impl Node {
         format!("{}/{topic}/{of}/{}", self.domain, self.distro.hash(publisher.of))
     }
 
-    /// Returns the identity of `publisher`, which comes with its messages: the same as long as its token is.
+    /// Returns the ID of `publisher` for the attachments of its messages. It is the same as long as its token is.
     pub fn gid(&self, publisher: &Publisher<'_>) -> [u8; 16] {
         let digest = Sha256::digest(self.publisher_token(publisher));
         std::array::from_fn(|i| digest[i])
     }
 
-    /// Returns the key under which the last message of a latched `publisher` is asked for, and which says as a token that it
-    /// can be: what `AdvancedPublisher` of `zenoh-ext` does for `rmw_zenoh`.
+    /// Returns the key under which subscribers query the last message of a latched `publisher`. As a token, it announces that
+    /// they can. `AdvancedPublisher` of `zenoh-ext` does this for `rmw_zenoh`.
     pub fn history_key(&self, publisher: &Publisher<'_>) -> String {
         format!("{}/@adv/pub/{}/{}/_", self.key(publisher), self.session, publisher.number)
     }
@@ -151,7 +151,7 @@ impl Node {
 }
 
 impl Type {
-    /// `sensor_msgs/msg/LaserScan` is `sensor_msgs::msg::dds_::LaserScan_`.
+    /// Returns the name in DDS: `sensor_msgs::msg::dds_::LaserScan_` for `sensor_msgs/msg/LaserScan`.
     fn dds_name(&self) -> String {
         let name = self.name.replace('/', "::");
         match name.rsplit_once("::") {
@@ -161,11 +161,11 @@ impl Type {
     }
 }
 
-/// Bytes of an attachment.
+/// Size of an attachment in bytes.
 pub const ATTACHMENT: usize = 33;
 
-/// Returns what comes with message number `number` (from 1) of a publisher with identity `gid`, sent at `sent_ns` since 1970:
-/// two 64-bit numbers, little-endian, the length of the identity and the identity.
+/// Returns the attachment of message `number` (from 1) of the publisher with ID `gid`, sent at `sent_ns` since 1970: two 64-bit
+/// numbers, little-endian, the length of the ID, and the ID.
 pub fn attachment(number: i64, sent_ns: i64, gid: [u8; 16]) -> [u8; ATTACHMENT] {
     let mut bytes = [0; ATTACHMENT];
     bytes[..8].copy_from_slice(&number.to_le_bytes());

@@ -1,17 +1,17 @@
-//! How a sensor is, for programs and for people: `std_msgs/msg/String` and `diagnostic_msgs/msg/DiagnosticArray`. Refuses
-//! to know where a status comes from.
+//! State of sensors and of the hub: the verdict as `std_msgs/msg/String`, diagnostics as
+//! `diagnostic_msgs/msg/DiagnosticArray`.
 
 use scanhub_schema::{State, Status, Verdict};
 
 use crate::cdr::Cdr;
 
-/// Writes the name of `verdict` to the end of `message`: `clear`, `slow`, `stop` or `unknown`.
+/// Appends the name of `verdict` to `message`: `clear`, `slow`, `stop` or `unknown`.
 pub fn verdict_word(message: &mut Vec<u8>, verdict: Verdict) {
     Cdr::begin(message).text(verdict.name());
 }
 
-/// Writes how `sensor` is to the end of `message`, at `now_ns` since 1970. `status` is what its hub said last, nothing if no
-/// hub says anything; `age_ns` is how long ago the last scan was measured.
+/// Appends the diagnostics of `sensor` at `now_ns` (since 1970) to `message`. `status` is the last one of its hub, or `None` if
+/// no hub publishes it. `age_ns` is the age of the last scan.
 pub fn diagnosis(
     message: &mut Vec<u8>,
     sensor: &str,
@@ -25,13 +25,13 @@ pub fn diagnosis(
     write(message, now_ns, level, [sensor, &words, hardware], &values);
 }
 
-/// Writes whether the hub is there to the end of `message`, at `now_ns` since 1970.
+/// Appends the diagnostics of the hub at `now_ns` (since 1970) to `message`. They report whether the hub runs.
 pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_there: bool) {
     let (level, words) = if is_there { (OK, "running") } else { (STALE, NO_HUB) };
     write(message, now_ns, level, ["hub", words, ""], &[]);
 }
 
-/// An array of one status.
+/// Writes an array of one status.
 fn write(
     message: &mut Vec<u8>,
     now_ns: u64,
@@ -53,7 +53,7 @@ fn write(
     }
 }
 
-/// Level and words.
+/// Returns level and message of a status.
 fn judged(status: &Status) -> (u8, String) {
     let state = status.state();
     let name = state.map_or("unknown state", State::name);
@@ -66,7 +66,7 @@ fn judged(status: &Status) -> (u8, String) {
     (level, loss.map_or(name.to_owned(), |loss| format!("{name}, {loss}")))
 }
 
-/// What is known, with its unit in the key.
+/// Returns the values of a status, with their units in the keys.
 fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
     let mut values = vec![
         ("state", status.state().map_or("unknown", State::name).to_owned()),
@@ -82,7 +82,7 @@ fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
     values
 }
 
-/// What is said if nobody says how a sensor is.
+/// Message if no hub publishes the status.
 const NO_HUB: &str = "no hub";
 
 /// `DiagnosticStatus.OK` and so on.

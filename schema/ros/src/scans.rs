@@ -1,14 +1,87 @@
-//! Points as `sensor_msgs/msg/PointCloud2`: a scan, its foreground, and a sweep in three dimensions.
+//! Scans as `sensor_msgs/msg/LaserScan`, and points as `sensor_msgs/msg/PointCloud2`: those of a scan, of its foreground, and
+//! of a sweep in three dimensions.
 
 use std::mem::offset_of;
 
-use scanhub_schema::{CloudPoint, Foreground, Header, Scan};
+use scanhub_schema::{CloudPoint, Code, Foreground, Header, Scan};
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
-use crate::laser_scan::stamp_ns;
 
-/// Appends the readings of `scan` in frame `frame` to `message`: a point for each beam with a reading, in the order of the
+/// Appends `scan` in frame `frame` to `message` as a LaserScan.
+///
+/// - Angles are in radians, counterclockwise from the sensor's x axis (ahead), in ascending order. They are those of the
+///   sensor, even if it is mounted upside down.
+/// - Ranges are in meters (REP 103), each the float nearest to the sensor's value. +inf means no echo within the sensor's
+///   range, -inf an object that is too near, and NaN an unknown range (REP 117).
+/// - The stamp is the time of the message's first beam. A clockwise scanner measures that beam last, and the time between
+///   beams is then negative.
+pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
+    let mut cdr = Cdr::begin(message);
+    cdr.header(stamp_ns(header, scan), frame);
+    let last = scan.beams().saturating_sub(1);
+    // Number of the beam that is beam `i` of the message.
+    let beam = |i: usize| if is_clockwise(scan) { last - i } else { i };
+    let (first_angle, step) = (scan.first_angle + beam(0) as f64 * scan.step, scan.step.abs());
+    for value in [
+        first_angle as f32,
+        (first_angle + last as f64 * step) as f32,
+        step as f32,
+        (beam_time_ns(scan) / 1e9) as f32,
+        (scan_time_us(header, scan) / 1e6) as f32,
+        meters(1, scan),
+        meters(scan.valid_to, scan),
+    ] {
+        cdr.f32(value);
+    }
+    cdr.floats((0..scan.beams()).map(|i| range_m(scan, beam(i))));
+    let intensities = scan.intensities();
+    cdr.floats((0..intensities.len()).map(|i| f32::from(intensities.get(beam(i)).unwrap_or_default())));
+}
+
+/// Returns the wall-clock time of the message's first beam.
+fn stamp_ns(header: &Header, scan: &Scan) -> u64 {
+    let first = if is_clockwise(scan) { scan.beams().saturating_sub(1) } else { 0 };
+    header.wall_ns.saturating_add_signed(scan.beam_ns(first))
+}
+
+fn is_clockwise(scan: &Scan) -> bool {
+    scan.step < 0.0
+}
+
+/// Returns the time from a beam of the message to the next one.
+fn beam_time_ns(scan: &Scan) -> f64 {
+    match f64::from(scan.beam_time_ns) {
+        // Beams between two others are measured one revolution later, so the time between beams is not constant.
+        _ if scan.turns > 1 => 0.0,
+        time if is_clockwise(scan) => -time,
+        time => time,
+    }
+}
+
+/// Returns the period of scans: that of the header, or otherwise the duration of a revolution.
+fn scan_time_us(header: &Header, scan: &Scan) -> f64 {
+    match header.period_us {
+        0 => f64::from(scan.beam_time_ns) * scan.beams() as f64 / 1e3,
+        period => period.into(),
+    }
+}
+
+fn range_m(scan: &Scan, i: usize) -> f32 {
+    match (scan.range(i), scan.code(i)) {
+        (Some(0), _) | (None, Some(Code::TooNear)) => f32::NEG_INFINITY,
+        (Some(range), _) => meters(range, scan),
+        (None, Some(Code::NoReturn | Code::Beyond)) => f32::INFINITY,
+        (None, _) => f32::NAN,
+    }
+}
+
+/// Returns the float nearest to `range` in meters.
+fn meters(range: u16, scan: &Scan) -> f32 {
+    (f64::from(range) * f64::from(scan.unit_um) / 1e6) as f32
+}
+
+/// Appends the readings of `scan` in frame `frame` to `message` as a PointCloud2: a point for each beam with a reading, in the order of the
 /// beams, with the stamp of the LaserScan. A point is x, y, z in meters (z is 0) and the intensity that the scanner reports
 /// (0 if it reports none), as 32-bit floats.
 pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
@@ -26,9 +99,9 @@ pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Sc
     cdr.bool(true);
 }
 
-/// Writes `foreground` of `scan`, of the frame `frame`, to the end of `message`: a point x, y, z (metres, 32-bit floats; z
-/// is 0) for each of its beams that has a distance, in the order of the beams, stamped as the scan is.
-/// Both must be of the same telegram: the scan says where its beams point.
+/// Appends the `foreground` of `scan` in frame `frame` to `message` as a PointCloud2 with the stamp of the LaserScan. It has a
+/// point x, y, z (meters, 32-bit floats; z is 0) for each of its beams that has a range, in the order of the beams. `scan` has
+/// the directions of the beams, and both must come from the same telegram.
 pub fn foreground_cloud(
     message: &mut Vec<u8>,
     frame: &str,
@@ -43,19 +116,19 @@ pub fn foreground_cloud(
     let width = points().count();
     let mut cdr = begin(message, stamp_ns(header, scan), frame, &AXES, (POINT, width));
     for (i, range) in points() {
-        let metres = f64::from(range) * f64::from(foreground.unit_um) / 1e6;
+        let meters = f64::from(range) * f64::from(foreground.unit_um) / 1e6;
         let (sin, cos) = scan.angle(i).sin_cos();
         cdr.bytes(
-            [metres * cos, metres * sin, 0.0].map(|axis| axis as f32).map(f32::to_le_bytes).as_flattened(),
+            [meters * cos, meters * sin, 0.0].map(|axis| axis as f32).map(f32::to_le_bytes).as_flattened(),
         );
     }
-    // No point is without a number.
+    // All points have coordinates.
     cdr.bool(true);
 }
 
-/// Writes the `points` of a sweep, of the robot's frame, to the end of `message`: x, y, z (metres, 32-bit floats), beam (its
-/// number in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind it), stamped as `header` is,
-/// which is that of the last of them.
+/// Appends the `points` of a sweep, in the robot's frame, to `message` as a PointCloud2: x, y, z (meters, 32-bit floats), beam
+/// (its number in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind the background). The
+/// stamp is that of `header`, which belongs to the last point.
 pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]) {
     let point = size_of::<CloudPoint>() as u32;
     let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &OF_SWEEPS, (point, points.len()));
@@ -67,7 +140,8 @@ pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]
     cdr.bool(true);
 }
 
-/// Writes all that stands before the points: of each a name, offset and type of its fields, and its bytes.
+/// Starts a PointCloud2 of `count` points that have `point` bytes each, up to the first point. `fields` are the name, offset and
+/// type of each field of a point.
 fn begin<'a>(
     message: &'a mut Vec<u8>,
     stamp_ns: u64,
@@ -96,7 +170,7 @@ fn begin<'a>(
 
 const AXES: [(&str, u32, u8); 3] = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
 const OF_SCANS: [(&str, u32, u8); 4] = [AXES[0], AXES[1], AXES[2], ("intensity", 12, FLOAT32)];
-/// Bytes of a point of a foreground.
+/// Size of a foreground point in bytes.
 const POINT: u32 = 12;
 const OF_SWEEPS: [(&str, u32, u8); 5] = [
     AXES[0],
@@ -112,10 +186,76 @@ const UINT8: u8 = 2;
 
 #[cfg(test)]
 mod tests {
-    use scanhub_schema::{ForegroundHead, ScanHead};
+    use scanhub_schema::{Family, ForegroundHead, ScanHead};
 
     use super::*;
     use crate::{POINT_CLOUD, read};
+
+    fn scan(ranges: &[u16], step_mdeg: u32) -> Box<Scan> {
+        Scan::of(ScanHead::lms(ranges.len(), -90_000, step_mdeg, 10, 13), ranges)
+    }
+
+    /// The numbers behind a frame of four letters, whose end makes three bytes of padding.
+    fn numbers(message: &[u8]) -> Vec<f32> {
+        let body = &message[4..];
+        assert_eq!(body[8..20], [5, 0, 0, 0, b'r', b'e', b'a', b'r', 0, 0, 0, 0]);
+        body[20..].chunks_exact(4).map(|four| f32::from_le_bytes(four.try_into().unwrap())).collect()
+    }
+
+    #[test]
+    fn a_scan_is_these_numbers() {
+        let header = Header { wall_ns: 1_700_000_001_000_000_000, period_us: 13_320, ..Header::default() };
+        let mut message = Vec::new();
+        let mut it = scan(&[100, 0x1FFF, 0x1FF7, 0x1FFE, 0, 0x1FF6], 1000);
+        it.intensity_bits = 3;
+        it.arrays().upper[1] = 7;
+        laser_scan(&mut message, "rear", &header, &it);
+        assert_eq!(message[..4], [0, 1, 0, 0]);
+        // The first of six beams of a degree each was measured five 360ths of a turn before the last, which stamps.
+        let nanosec = 1_000_000_000 - 5 * 37_000;
+        assert_eq!(message[4..8], 1_700_000_000_i32.to_le_bytes());
+        assert_eq!(message[8..12], (nanosec as u32).to_le_bytes());
+        let told = numbers(&message);
+        let near = |a: f32, b: f32| (a - b).abs() < 1e-6;
+        assert!(near(told[0], -std::f32::consts::FRAC_PI_2) && near(told[1], 5_f32.to_radians() + told[0]));
+        assert!(near(told[2], 1_f32.to_radians()) && near(told[3], 37e-6) && near(told[4], 0.01332));
+        // The maximum range is within the limit of the message.
+        assert_eq!((told[5], told[6], told[13]), (0.01, 81.82, 81.82));
+        assert_eq!(told[7].to_bits(), 6);
+        assert_eq!(
+            (told[8], told[9], told[10], told[12]),
+            (1.0, f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY)
+        );
+        assert!(told[11].is_nan());
+        assert_eq!(told[14].to_bits(), 6);
+        assert_eq!(told[15..], [0.0, 7.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn beams_of_several_turns_have_no_one_time_between_them() {
+        let mut message = Vec::new();
+        let between = scan(&[100; 9], 500);
+        laser_scan(&mut message, "rear", &Header { wall_ns: 1 << 60, ..Header::default() }, &between);
+        let told = numbers(&message);
+        assert_eq!((told[3], told[7].to_bits(), told[17].to_bits(), told.len()), (0.0, 9, 0, 18));
+    }
+
+    #[test]
+    fn angles_ascend_also_of_a_scanner_that_turns_clockwise() {
+        let mut head = ScanHead::turning(Family::Ld, 4);
+        (head.beam_time_ns, head.first_beam_ns) = (25_000_000, 0);
+        let mut it = Scan::of(head, &[1000, 2000, 3000, 4000]);
+        it.arrays().upper.copy_from_slice(&[1, 2, 3, 4]);
+        let mut message = Vec::new();
+        laser_scan(&mut message, "rear", &Header { wall_ns: 5_000_000_000, ..Header::default() }, &it);
+        let told = numbers(&message);
+        let quarter = std::f32::consts::FRAC_PI_2;
+        // The grid begins ahead and turns to the right; its last beam looks left and was measured 75 ms after the first.
+        assert_eq!(message[4..12], [5, 0, 0, 0, 0xC0, 0x68, 0x78, 0x04]);
+        assert_eq!(told[..5], [-3.0 * quarter, 0.0, quarter, -0.025, 0.1]);
+        assert_eq!(told[8..12], [4.0, 3.0, 2.0, 1.0]);
+        assert_eq!(told[13..], [4.0, 3.0, 2.0, 1.0]);
+    }
 
     #[test]
     fn points_are_where_the_beams_of_the_foreground_hit() {
