@@ -3,11 +3,12 @@
 
 use std::fmt;
 
-use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
+use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, cast_slice_mut, pod_read_unaligned};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::Packed;
+use crate::BEAMS;
+use crate::datagram::{Packed, packed_as_is, read_head, write};
 use crate::limits::TopicLimits;
 use crate::sliced::sliced;
 use crate::topic::PayloadLen;
@@ -47,6 +48,8 @@ impl PayloadLen for Background {
         Background::len(limits.beams)
     }
 }
+
+packed_as_is!(Background);
 
 impl Background {
     /// Range of a beam whose background is unknown.
@@ -104,6 +107,18 @@ impl Background {
 
     fn used(&self) -> usize {
         Background::len(self.ranges().len())
+    }
+
+    /// Returns the length of the model in a datagram's payload, or `None` if it is not valid.
+    fn packed_len(payload: &[u8]) -> Option<usize> {
+        let head: BackgroundHead = read_head(payload)?;
+        let len = Background::len(head.count.into());
+        let is_finite = head.first_angle.is_finite() && head.step.is_finite();
+        (usize::from(head.count) <= BEAMS && is_finite && len <= payload.len()).then_some(len)
+    }
+
+    fn widen(limits: &mut TopicLimits, head: &BackgroundHead) {
+        limits.beams = limits.beams.max(head.count.into());
     }
 }
 
@@ -249,13 +264,8 @@ impl Foreground {
     }
 
     /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
-    pub(crate) fn bits(&self) -> &[u8] {
+    fn bits(&self) -> &[u8] {
         self.memory().get(BITS..BITS + self.scan_beams().div_ceil(8)).unwrap_or_default()
-    }
-
-    /// Sets the first `len` bytes to 0. Returns `false` if there is too little memory.
-    pub(crate) fn clear(&mut self, len: usize) -> bool {
-        self.memory_mut().get_mut(..len).map(|memory| memory.fill(0)).is_some()
     }
 
     /// Returns the number of beams of the scan, or 0 if there is too little memory for them.
@@ -266,6 +276,91 @@ impl Foreground {
 
     fn used(&self) -> usize {
         Foreground::len(self.scan_beams())
+    }
+}
+
+impl Packed for Foreground {
+    /// Writes head, bits, the used ranges, and as many segments as there is room for. The other segments are counted as
+    /// left out.
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        let fixed = |head: &ForegroundHead, room: &mut [u8]| {
+            write(room, &[bytes_of(head), self.bits(), cast_slice::<u16, u8>(self.ranges())])
+        };
+        let used = fixed(self, room)?;
+        let fit = self.segments().len().min((room.len() - used) / size_of::<Segment>());
+        let left_out = usize::from(self.left_out) + self.segments().len() - fit;
+        let left_out = left_out.min(usize::from(u16::MAX)) as u16;
+        let supported = self.supported & first_bits(fit);
+        let used = fixed(&ForegroundHead { segments: fit as u16, left_out, supported, ..**self }, room)?;
+        Some(used + write(&mut room[used..], &[cast_slice(&self.segments()[..fit])])?)
+    }
+
+    fn room(payload: &[u8]) -> Option<usize> {
+        let (head, parts) = PackedArrays::of(payload)?;
+        let is_inside = |segment: Segment| segment.first <= segment.last && segment.last < head.count;
+        let mut segments = parts.segments.chunks_exact(size_of::<Segment>()).map(pod_read_unaligned);
+        let members: u32 = parts.bits.iter().map(|byte| byte.count_ones()).sum();
+        let unused = parts.bits.last().map_or(0, |last| match head.count % 8 {
+            0 => 0,
+            used => last >> used,
+        });
+        let is_valid = segments.all(is_inside)
+            && members == u32::from(head.beams)
+            && unused == 0
+            && head.supported & !first_bits(head.segments.into()) == 0;
+        is_valid.then_some(Foreground::len(head.count.into()))
+    }
+
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        if let Some(head) = read_head::<ForegroundHead>(payload) {
+            limits.beams = limits.beams.max(head.count.into());
+        }
+    }
+
+    fn unpack(&mut self, payload: &[u8]) -> bool {
+        let Some(len) = Foreground::room(payload) else { return false };
+        let Some(memory) = self.memory_mut().get_mut(..len) else { return false };
+        memory.fill(0);
+        let Some((head, parts)) = PackedArrays::of(payload) else { return false };
+        let ForegroundArrays { segments, bits, ranges } = self.begin(head);
+        bits.copy_from_slice(parts.bits);
+        cast_slice_mut(&mut ranges[..head.beams.into()]).copy_from_slice(parts.ranges);
+        cast_slice_mut(&mut segments[..head.segments.into()]).copy_from_slice(parts.segments);
+        true
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        Foreground::room(payload).is_some_and(|len| {
+            Foreground::grow(place, len);
+            place.unpack(payload)
+        })
+    }
+}
+
+/// Returns a word with a bit for each of the first `segments` segments.
+fn first_bits(segments: usize) -> u64 {
+    if segments < SEGMENTS { (1 << segments) - 1 } else { u64::MAX }
+}
+
+/// Arrays after the head of a foreground in a datagram, as bytes.
+struct PackedArrays<'a> {
+    bits: &'a [u8],
+    ranges: &'a [u8],
+    segments: &'a [u8],
+}
+
+impl PackedArrays<'_> {
+    /// Returns head and arrays, or `None` if the payload is too short or has too many elements.
+    fn of(payload: &[u8]) -> Option<(ForegroundHead, PackedArrays<'_>)> {
+        let head: ForegroundHead = read_head(payload)?;
+        let [count, beams, used] = [head.count, head.beams, head.segments].map(usize::from);
+        if count > BEAMS || beams > count || used > SEGMENTS {
+            return None;
+        }
+        let (bits, rest) = payload[Foreground::HEAD..].split_at_checked(count.div_ceil(8))?;
+        let (ranges, rest) = rest.split_at_checked(2 * beams)?;
+        let segments = rest.get(..used * size_of::<Segment>())?;
+        Some((head, PackedArrays { bits, ranges, segments }))
     }
 }
 

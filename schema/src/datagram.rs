@@ -14,7 +14,8 @@ use crate::Topic;
 
 pub use announce::{Announce, Announced};
 pub use gateway_runs::{Arrival, LIVES, Standing};
-pub use payload::Packed;
+pub use payload::{FixedPayload, Packed, UsedElements};
+pub(crate) use payload::{are_finite, packed_as_is, read_head, used_elements, write};
 pub use stream_stats::{Fresh, GivenUp, ROWS, Row, StreamStats, WINDOW};
 
 /// Bytes of the header.

@@ -4,6 +4,8 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::{FixedPayload, UsedElements, are_finite, used_elements};
+
 /// Maximum number of marks of a scan.
 pub const MARKS: usize = 64;
 
@@ -47,6 +49,10 @@ impl Default for Marks {
     fn default() -> Self {
         Zeroable::zeroed()
     }
+}
+
+impl FixedPayload for Marks {
+    const ARRAYS: &'static [UsedElements] = &[used_elements!(Marks, mark_array: [Mark; MARKS], count)];
 }
 
 impl Marks {
@@ -157,6 +163,25 @@ pub struct Corner {
 impl Default for Lines {
     fn default() -> Self {
         Zeroable::zeroed()
+    }
+}
+
+impl FixedPayload for Lines {
+    const ARRAYS: &'static [UsedElements] = &[
+        used_elements!(Lines, line_array: [Line; LINES], count),
+        used_elements!(Lines, corner_array: [Corner; LINES], corners),
+    ];
+
+    fn is_valid(&self) -> bool {
+        let is_finite = |line: &Line| {
+            let &Line { x1_m, y1_m, x2_m, y2_m, r_m, alpha_rad, sd_r_m, sd_alpha_rad, .. } = line;
+            are_finite(&[x1_m, y1_m, x2_m, y2_m, r_m, alpha_rad, sd_r_m, sd_alpha_rad])
+        };
+        let is_corner = |corner: &Corner| {
+            let has_lines = corner.first_line.max(corner.second_line) < self.count.into();
+            has_lines && are_finite(&[corner.x_m, corner.y_m])
+        };
+        self.noise_m.is_finite() && self.lines().iter().all(is_finite) && self.corners().iter().all(is_corner)
     }
 }
 

@@ -29,33 +29,30 @@ pub mod limits;
 #[cfg(feature = "json")]
 mod saved;
 
-pub use background::{
-    Background, BackgroundHead, BackgroundWord, Foreground, ForegroundArrays, ForegroundHead, ForegroundWord,
-    SEGMENTS, Segment,
-};
+/// The payloads of all topics, with the types of their fields. The client library exports them too.
+pub mod payloads {
+    pub use crate::background::*;
+    pub use crate::landmarks::*;
+    pub use crate::motion::*;
+    pub use crate::scan::*;
+    pub use crate::status::*;
+    pub use crate::telegram::*;
+    pub use crate::tilt::*;
+    pub use crate::tracks::*;
+    pub use crate::zones::*;
+}
+
 pub use control::{Request, Response, Shown, Verb};
 pub use failure::{Failure, Kind};
 pub use header::{Flags, Header, Quality, Reasons};
-pub use landmarks::{Corner, LINES, Line, Lines, MARKS, Mark, Marks};
-pub use motion::{Motion, MotionMethod};
+pub use payloads::*;
 pub use pose::Pose;
-pub use scan::{
-    BEAMS, Code, Contents, Family, Intensities, PacketFacts, Scan, ScanArrays, ScanHead, ScanWord,
-    in_degrees, in_sector_mdeg,
-};
-pub use status::{COUNTERS, Counter, Counters, State, Status};
-pub use telegram::Telegram;
 pub use text::{Printable, escape_json, json_line};
-pub use tilt::{
-    Cloud, CloudHead, CloudPoint, CloudWord, OBSTACLES, Obstacle, Obstacles, PointClass, SweepPoints, Tilt,
-};
 pub use time::{Age, MICROS, MILLIS, MIN_RATE_SPAN, Nanos, line_time, rate_hz};
 pub use topic::{
     CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Maker, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake,
     check_followed, check_sensor, is_remote, of_service,
 };
-pub use tracks::{Event, EventKind, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
-pub use zones::{Early, Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};

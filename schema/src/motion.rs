@@ -6,6 +6,8 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::{FixedPayload, are_finite};
+
 /// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///
 /// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of all
@@ -95,6 +97,17 @@ impl fmt::Display for MotionMethod {
 impl Default for Motion {
     fn default() -> Self {
         Zeroable::zeroed()
+    }
+}
+
+impl FixedPayload for Motion {
+    /// It ends before the covariance of the pose.
+    const FIRST_REVISION: usize = std::mem::offset_of!(Motion, pose_covariance);
+
+    fn is_valid(&self) -> bool {
+        let step = [self.dx_m, self.dy_m, self.dyaw_rad, self.overlap];
+        are_finite(&[self.x_m, self.y_m, self.yaw_rad])
+            && are_finite(step.iter().chain(&self.covariance).chain(&self.pose_covariance))
     }
 }
 

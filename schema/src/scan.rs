@@ -9,6 +9,7 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::{packed_as_is, read_head};
 use crate::limits::TopicLimits;
 use crate::sliced::sliced;
 use crate::topic::PayloadLen;
@@ -124,6 +125,8 @@ impl PayloadLen for Scan {
         Scan::len(limits.beams, limits.contents)
     }
 }
+
+packed_as_is!(Scan);
 
 impl Scan {
     /// Range of a beam that was not measured, in every family. It is neither a reading nor a missing echo.
@@ -284,6 +287,20 @@ impl Scan {
 
     fn used(&self) -> usize {
         Scan::len(self.beams(), self.contents)
+    }
+
+    /// Returns the length of the scan in a datagram's payload, or `None` if it is not valid.
+    fn packed_len(payload: &[u8]) -> Option<usize> {
+        let head: ScanHead = read_head(payload)?;
+        let len = Scan::len(head.count.into(), head.contents);
+        let is_known = usize::from(head.count) <= BEAMS && head.contents & !Contents::ALL == 0;
+        let is_finite = head.first_angle.is_finite() && head.step.is_finite() && head.spacing.is_finite();
+        (is_known && is_finite && len <= payload.len()).then_some(len)
+    }
+
+    fn widen(limits: &mut TopicLimits, head: &ScanHead) {
+        limits.beams = limits.beams.max(head.count.into());
+        limits.contents |= head.contents;
     }
 }
 

@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::FixedPayload;
 use crate::scan::{REFLECTOR_MODE, has_reflector_bits};
 use crate::{Family, Pose, text};
 
@@ -54,6 +55,8 @@ impl Default for Status {
         Status { mode: Status::MODE_UNKNOWN, ..Zeroable::zeroed() }
     }
 }
+
+impl FixedPayload for Status {}
 
 impl Status {
     /// The measuring mode as long as the sensor has not reported it.

@@ -3,14 +3,15 @@
 
 use std::fmt;
 
-use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
+use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut, pod_read_unaligned};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::Header;
+use crate::datagram::{FixedPayload, UsedElements, are_finite, packed_as_is, read_head, used_elements};
 use crate::limits::TopicLimits;
 use crate::sliced::sliced;
 use crate::topic::PayloadLen;
+use crate::{BEAMS, Header};
 
 /// The payload of topic `tilt`, 16 bytes: the angle of a mount. Both stamps of the sample are the time at which the
 /// mount had this angle, not the time of the report.
@@ -28,6 +29,12 @@ impl Default for Tilt {
     /// Returns angle 0 with an unknown rate.
     fn default() -> Self {
         Tilt { angle_rad: 0.0, rate_rad_s: f64::NAN }
+    }
+}
+
+impl FixedPayload for Tilt {
+    fn is_valid(&self) -> bool {
+        self.angle_rad.is_finite() && !self.rate_rad_s.is_infinite()
     }
 }
 
@@ -119,6 +126,8 @@ impl PayloadLen for Cloud {
     }
 }
 
+packed_as_is!(Cloud);
+
 impl Cloud {
     /// Flag: the first sample of its sweep.
     pub const FIRST: u8 = 1;
@@ -165,6 +174,18 @@ impl Cloud {
 
     fn used(&self) -> usize {
         Cloud::len(self.points().len())
+    }
+
+    /// Returns the length of the cloud in a datagram's payload, or `None` if it is not valid.
+    fn packed_len(payload: &[u8]) -> Option<usize> {
+        let count = usize::from(read_head::<CloudHead>(payload)?.count);
+        let points = payload.get(Cloud::HEAD..Cloud::len(count)).filter(|_| count <= BEAMS)?;
+        let mut points = points.chunks_exact(size_of::<CloudPoint>()).map(pod_read_unaligned);
+        points.all(|point: CloudPoint| are_finite(&point.at)).then_some(Cloud::len(count))
+    }
+
+    fn widen(limits: &mut TopicLimits, head: &CloudHead) {
+        limits.beams = limits.beams.max(head.count.into());
     }
 }
 
@@ -284,6 +305,18 @@ impl Obstacle {
 impl Default for Obstacles {
     fn default() -> Self {
         Zeroable::zeroed()
+    }
+}
+
+impl FixedPayload for Obstacles {
+    const ARRAYS: &'static [UsedElements] =
+        &[used_elements!(Obstacles, obstacle_array: [Obstacle; OBSTACLES], count)];
+
+    fn is_valid(&self) -> bool {
+        let is_finite = |one: &Obstacle| {
+            are_finite([one.middle, one.low, one.high].as_flattened()) && one.distance_m.is_finite()
+        };
+        self.obstacles().iter().all(is_finite)
     }
 }
 

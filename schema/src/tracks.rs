@@ -4,6 +4,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::{FixedPayload, UsedElements, are_finite, used_elements};
 use crate::{Pose, text};
 
 /// Maximum number of people in a sample.
@@ -118,6 +119,23 @@ impl Default for Tracks {
 impl Default for TrackSensor {
     fn default() -> Self {
         Zeroable::zeroed()
+    }
+}
+
+impl FixedPayload for Tracks {
+    const ARRAYS: &'static [UsedElements] = &[
+        used_elements!(Tracks, track_array: [Track; TRACKS], count),
+        used_elements!(Tracks, sensor_array: [TrackSensor; TRACK_SENSORS], sensors),
+    ];
+
+    fn is_valid(&self) -> bool {
+        let is_track = |track: &Track| {
+            let &Track { x_m, y_m, vx_m_s, vy_m_s, score, sensors, .. } = track;
+            let numbers = [x_m, y_m, vx_m_s, vy_m_s, score];
+            are_finite(numbers.iter().chain(&track.covariance)) && u64::from(sensors) >> self.sensors == 0
+        };
+        let is_placed = |sensor: &TrackSensor| are_finite(&[sensor.x_m, sensor.y_m, sensor.yaw_rad]);
+        self.tracks().iter().all(is_track) && self.sensors().iter().all(is_placed)
     }
 }
 
@@ -245,6 +263,12 @@ impl EventKind {
     /// Returns the kind with this number, or `None` if this version does not know it.
     pub fn of_number(number: u8) -> Option<EventKind> {
         EventKind::ALL.get(usize::from(number)).copied()
+    }
+}
+
+impl FixedPayload for Event {
+    fn is_valid(&self) -> bool {
+        self.kind().is_some()
     }
 }
 

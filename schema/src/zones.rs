@@ -4,6 +4,8 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::datagram::{FixedPayload, UsedElements, used_elements};
+
 /// Maximum number of zones of a sensor.
 pub const ZONES: usize = 8;
 
@@ -49,6 +51,10 @@ impl Default for Zones {
     fn default() -> Self {
         Zones::unknown()
     }
+}
+
+impl FixedPayload for Zones {
+    const ARRAYS: &'static [UsedElements] = &[used_elements!(Zones, zone_array: [Zone; ZONES], count)];
 }
 
 impl Zones {
@@ -160,6 +166,12 @@ pub struct Early {
     pub bytes_seen: u16,
     /// Beams of the scan that had arrived.
     pub beams_seen: u16,
+}
+
+impl FixedPayload for Early {
+    fn is_valid(&self) -> bool {
+        matches!(self.verdict(), Verdict::Slow | Verdict::Stop)
+    }
 }
 
 impl Early {

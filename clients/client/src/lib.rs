@@ -55,13 +55,10 @@ pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};
 
-/// The types of topics and payloads: a program needs no second dependency.
+/// The types of topics and payloads. A program needs no second dependency.
 pub use scanhub_schema::{
-    Age, BEAMS, Background, Cloud, CloudHead, CloudPoint, Code, Corner, Counter, Counters, Early, Event,
-    EventKind, Failure, Flags, Foreground, Header, Kind, LINES, Line, Lines, MARKS, Mark, Marks, Motion,
-    MotionMethod, OBSTACLES, Obstacle, Obstacles, PointClass, Pose, Quality, ROBOT, Reasons, Request,
-    SEGMENTS, Scan, Segment, Shown, State, Status, SweepPoints, TRACKS, Telegram, Tilt, Topic, Track,
-    TrackState, Tracks, Verb, Verdict, Wake, ZONES, Zone, Zones,
+    Age, Failure, Flags, Header, Kind, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake,
+    payloads::*,
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 

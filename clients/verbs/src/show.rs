@@ -1,14 +1,13 @@
-//! How the payload of each topic is shown: as a line of JSON and as a line for people, whether it came from shared
-//! memory or from a network. A new payload is described here; everything else follows from the table of topics.
+//! Shows the payload of each topic as a line of JSON and as a line for people, whether it was received through shared
+//! memory or from a network.
+//!
+//! It follows from the table of topics: modules `json` and `text` have a function with the name of each topic.
 
 use std::io;
 
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
-use scanhub_schema::{
-    Background, Cloud, Early, Event, Foreground, Header, Lines, Marks, Motion, Obstacles, Scan, Status, Tilt,
-    Tracks, Zones,
-};
+use scanhub_schema::{Background, Event, Header, Status, Zones};
 use scanhub_shm::Payload;
 use serde::Serialize;
 
@@ -36,40 +35,37 @@ pub(crate) trait Show {
     fn text(&self, header: &Header, line: &mut Vec<u8>) -> io::Result<()>;
 }
 
-/// Declares how payloads are shown: functions of `json` and `text`, most with the header of the sample.
+/// Implements [`Show`] for the payloads of all topics, with the functions of `json` and `text` that have the topic's name.
 macro_rules! shown {
-    ($($payload:ty, $function:ident $(($header:ident))?;)*) => {$(
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        $(shown! { $payload, $name })*
+    };
+    // Implemented below.
+    (Zones, $name:ident) => {};
+    (Event, $name:ident) => { shown! { @impl Event, event(header) } };
+    // Classes without the numbers and stamps of the sample.
+    (Background, $name:ident) => { shown! { @impl Background, $name() } };
+    (Status, $name:ident) => { shown! { @impl Status, $name() } };
+    ($payload:tt, $name:ident) => {
+        shown! { @impl scanhub_schema::payload_type!($payload), $name(header) }
+    };
+    (@impl $payload:ty, $function:ident($($header:ident)?)) => {
         impl Show for $payload {
             fn json(&self, sensor: &str, _header: &Header, to: impl Keys) -> Result<(), End> {
-                to.take(json::$function(sensor, $(shown!($header _header),)? self))
+                to.take(json::$function(sensor, $(shown!(@ $header _header),)? self))
             }
 
             fn text(&self, _header: &Header, line: &mut Vec<u8>) -> io::Result<()> {
-                text::$function(line, $(shown!($header _header),)? self)
+                text::$function(line, $(shown!(@ $header _header),)? self)
             }
         }
-    )*};
-    (header $header:ident) => { $header };
+    };
+    (@ header $header:ident) => { $header };
 }
 
-shown! {
-    [u8], telegram(header);
-    Scan, scan(header);
-    Marks, marks(header);
-    Lines, lines(header);
-    Motion, motion(header);
-    Early, early(header);
-    Tracks, tracks(header);
-    Event, event(header);
-    Tilt, tilt(header);
-    Cloud, cloud(header);
-    Obstacles, obstacles(header);
-    Foreground, foreground(header);
-    Background, background;
-    Status, status;
-}
+scanhub_schema::for_each_topic!(shown);
 
-/// As they came: how old they are was seen to before.
+/// Shows the zones as they were received. The caller has checked their age.
 impl Show for Zones {
     fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End> {
         to.take(json::zones(sensor, &heard(self, header)))

@@ -17,9 +17,9 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
-pub(crate) use people::{event, event_words, tracks};
-pub(crate) use processed::{background, early, foreground, lines, marks, motion, robot, zones};
-pub(crate) use tilted::{cloud, obstacles, tilt};
+pub(crate) use people::*;
+pub(crate) use processed::*;
+pub(crate) use tilted::*;
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);

@@ -1,87 +1,116 @@
-//! What a gateway announces about a sensor once a second: its name and type, which topic is sent where, and the next
-//! number of each topic, from which a listener knows what it lost before the first and after the last datagram.
+//! The announcement of a sensor, which a gateway sends once a second: name and type of the sensor, and group, port and
+//! next sequence number of each topic. The sequence numbers show a listener what it lost before the first and after the
+//! last datagram.
 
+use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, pod_read_unaligned};
+
+use super::payload::{read_head, write};
+use super::{HEAD, MAC, MTU_LEAST};
 use crate::{Topic, check_sensor, text};
 
-/// The payload of an announcement, made by a gateway or read from a datagram.
+/// The payload of an announcement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Announce {
-    /// Run of the hub.
+    /// Random number of the hub's run.
     pub boot: u64,
-    name: [u8; NAME],
-    kind: [u8; KIND],
-    topics: [Announced; MOST],
-    count: usize,
-    replaced: [u32; MOST],
-    /// Of how many topics it says how many samples were replaced: none, or all.
-    replaced_count: usize,
+    /// All fields but `boot` are as they are sent.
+    head: AnnounceHead,
+    topics: [Announced; MAX_TOPICS],
+    /// Number of replaced samples of each topic, if [`AnnounceHead::REPLACED`] is set.
+    replaced: [u32; MAX_TOPICS],
 }
 
-/// One topic in an announcement.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+/// Start of an announcement, before the topics. 68 bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C, packed(4))]
+struct AnnounceHead {
+    /// Random number of the hub's run.
+    boot: u64,
+    /// Name of the sensor: 1 to 24 of a-z, 0-9, _ and -.
+    sensor_text: [u8; 32],
+    /// Type that the sensor reports; empty if unknown.
+    type_text: [u8; 24],
+    /// Number of topics that are sent.
+    count: u8,
+    /// Flags: [`AnnounceHead::REPLACED`].
+    flags: u8,
+    /// 0.
+    reserved: [u8; 2],
+}
+
+impl AnnounceHead {
+    /// Flag, in revision 2 from a bridge: the numbers of replaced samples follow the topics.
+    const REPLACED: u8 = 1;
+}
+
+/// One topic of an announcement. 8 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
 pub struct Announced {
-    /// Number of the topic, see [`Topic::of_number`].
+    /// Number of the topic, as in the header.
     pub topic: u8,
-    /// The last byte of its group.
+    /// Last byte of the address of its group.
     pub group: u8,
-    /// Its port.
+    /// Port that it is sent to.
     pub port: u16,
-    /// Number that its next datagram will have.
+    /// Sequence number that its next datagram will have.
     pub next: u32,
 }
 
+/// Maximum number of topics of an announcement: 37. That many fit into the shortest datagram that a gateway may be limited
+/// to, with a MAC and the numbers of replaced samples. An announcement is never sent in parts.
+const MAX_TOPICS: usize = (MTU_LEAST - HEAD - MAC - size_of::<AnnounceHead>()) / (size_of::<Announced>() + 4);
+
+const _: () = assert!(Topic::ALL.len() <= MAX_TOPICS);
+
 impl Announce {
-    /// Topic number of announcements themselves.
+    /// Topic number of announcements.
     pub const NUMBER: u8 = 0;
-    /// The last byte of their group.
+    /// Last byte of the address of their group.
     pub const GROUP: u8 = 80;
 
-    /// Makes one for `sensor`, a sensor of type `kind`, without topics.
+    /// Creates an announcement of `sensor`, a sensor of type `kind`, without topics. `boot` identifies the run of its hub.
     pub fn new(boot: u64, sensor: &str, kind: &str) -> Announce {
-        let mut announce = Announce {
-            boot,
-            name: [0; NAME],
-            kind: [0; KIND],
-            topics: [Announced::default(); MOST],
-            count: 0,
-            replaced: [0; MOST],
-            replaced_count: 0,
-        };
-        text::write(&mut announce.name, sensor);
-        text::write(&mut announce.kind, kind);
-        announce
+        let mut head = AnnounceHead::zeroed();
+        text::write(&mut head.sensor_text, sensor);
+        text::write(&mut head.type_text, kind);
+        Announce { boot, head, topics: [Announced::default(); MAX_TOPICS], replaced: [0; MAX_TOPICS] }
     }
 
-    /// Adds a topic; beyond 16 there is no room and it is left out.
+    /// Adds a topic, or ignores it if there are 37 already.
     pub fn add(&mut self, topic: Announced) {
-        if let Some(place) = self.topics.get_mut(self.count) {
+        if let Some(place) = self.topics.get_mut(usize::from(self.head.count)) {
             *place = topic;
-            self.count += 1;
+            self.head.count += 1;
         }
     }
 
-    /// Says of the topic that was added last how many of its samples were replaced by newer ones before they had a number;
-    /// the count wraps. To be said of all topics or of none.
+    /// Sets how many samples of the topic that was added last were replaced by newer ones before they got a sequence number.
+    /// The number wraps. Call it for all topics or for none.
     pub fn add_replaced(&mut self, replaced: u64) {
-        if let Some(place) = self.replaced[..self.count].last_mut() {
+        if let Some(place) = self.replaced[..usize::from(self.head.count)].last_mut() {
             *place = replaced as u32;
-            self.replaced_count = self.count;
+            self.head.flags |= AnnounceHead::REPLACED;
         }
     }
 
-    /// Returns how many samples of the topic with this number were replaced by newer ones before they had a number; the count
-    /// wraps. Nothing if that is not said.
+    /// Returns how many samples of the topic with this number were replaced by newer ones before they got a sequence number.
+    /// The number wraps. `None` if the gateway does not report it.
     pub fn replaced(&self, topic: u8) -> Option<u32> {
-        let said = self.topics[..self.replaced_count].iter().zip(self.replaced);
-        said.into_iter().find(|(announced, _)| announced.topic == topic).map(|(_, replaced)| replaced)
+        let at = self.topics().iter().position(|announced| announced.topic == topic)?;
+        self.has_replaced().then(|| self.replaced[at])
     }
 
-    /// Returns the revision of the payload: 2 if it says what was replaced, else 1.
+    fn has_replaced(&self) -> bool {
+        self.head.flags & AnnounceHead::REPLACED != 0
+    }
+
+    /// Returns the revision of the payload: 2 with numbers of replaced samples, otherwise 1.
     pub fn revision(&self) -> u16 {
-        if self.replaced_count > 0 { 2 } else { 1 }
+        1 + u16::from(self.has_replaced())
     }
 
-    /// Returns the same announcement of those of its topics alone that are among `topics`.
+    /// Returns the announcement with only those of its topics that are among `topics`.
     pub fn only(&self, topics: &[Topic]) -> Announce {
         let mut only = Announce::new(self.boot, self.sensor(), self.kind());
         for announced in self.topics() {
@@ -97,82 +126,50 @@ impl Announce {
 
     /// Returns the sensor's name.
     pub fn sensor(&self) -> &str {
-        text::read(&self.name)
+        text::read(&self.head.sensor_text)
     }
 
     /// Returns the sensor's type; empty if unknown.
     pub fn kind(&self) -> &str {
-        text::read(&self.kind)
+        text::read(&self.head.type_text)
     }
 
-    /// Returns the topics that go out.
+    /// Returns the topics that are sent.
     pub fn topics(&self) -> &[Announced] {
-        &self.topics[..self.count]
+        &self.topics[..usize::from(self.head.count)]
     }
 
-    /// Writes the payload to the start of `room`; returns its length, or `None` if there is too little room.
+    /// Writes the payload to the start of `room`. Returns its length, or `None` if there is too little room.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        let topics_end = TOPICS + EACH * self.count;
-        let room = room.get_mut(..topics_end + 4 * self.replaced_count)?;
-        room[..8].copy_from_slice(&self.boot.to_le_bytes());
-        room[8..40].copy_from_slice(&self.name);
-        room[40..64].copy_from_slice(&self.kind);
-        let flags = if self.replaced_count > 0 { REPLACED } else { 0 };
-        room[64..TOPICS].copy_from_slice(&[self.count as u8, flags, 0, 0]);
-        for (bytes, topic) in room[TOPICS..topics_end].chunks_exact_mut(EACH).zip(self.topics()) {
-            bytes[..2].copy_from_slice(&[topic.topic, topic.group]);
-            bytes[2..4].copy_from_slice(&topic.port.to_le_bytes());
-            bytes[4..].copy_from_slice(&topic.next.to_le_bytes());
-        }
-        let replaced = &self.replaced[..self.replaced_count];
-        for (bytes, replaced) in room[topics_end..].chunks_exact_mut(4).zip(replaced) {
-            bytes.copy_from_slice(&replaced.to_le_bytes());
-        }
-        Some(room.len())
+        let replaced = if self.has_replaced() { usize::from(self.head.count) } else { 0 };
+        let replaced = cast_slice(&self.replaced[..replaced]);
+        let head = AnnounceHead { boot: self.boot, ..self.head };
+        write(room, &[bytes_of(&head), cast_slice(self.topics()), replaced])
     }
 
-    /// Returns the announcement in `payload`; `None` if it is shorter than its own count says, or if its sensor has no possible
-    /// name. Topics beyond the 16th are left away. What was replaced is read if it is said of all topics.
+    /// Returns the announcement in `payload`, with its first 37 topics. `None` if it is shorter than its own count requires, or
+    /// if the sensor's name is not valid. Numbers of replaced samples are read only if all topics have one.
     pub fn unpack(payload: &[u8]) -> Option<Announce> {
-        let (head, rest) = payload.split_first_chunk::<TOPICS>()?;
-        let (rest, more) = rest.split_at_checked(EACH * usize::from(head[64]))?;
-        let (boot, _) = head.split_first_chunk()?;
+        let head: AnnounceHead = read_head(payload)?;
+        let count = usize::from(head.count);
+        let (topics, replaced) =
+            payload[size_of::<AnnounceHead>()..].split_at_checked(count * size_of::<Announced>())?;
         let mut announce =
-            Announce::new(u64::from_le_bytes(*boot), text::read(&head[8..40]), text::read(&head[40..64]));
-        // What is no text ends what is read of a field, but not the name.
-        let name_len = head[8..40].iter().position(|&byte| byte == 0)?;
+            Announce::new(head.boot, text::read(&head.sensor_text), text::read(&head.type_text));
+        // A byte that is not UTF-8 ends the text, but not the name.
+        let name_len = head.sensor_text.iter().position(|&byte| byte == 0)?;
         check_sensor(announce.sensor()).ok().filter(|()| announce.sensor().len() == name_len)?;
-        for bytes in rest.chunks_exact(EACH) {
-            announce.add(Announced {
-                topic: bytes[0],
-                group: bytes[1],
-                port: u16::from_le_bytes([bytes[2], bytes[3]]),
-                next: u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]),
-            });
-        }
-        let (replaced, _) = more.as_chunks::<4>();
-        if head[65] & REPLACED != 0 && replaced.len() >= usize::from(head[64]) {
-            announce.replaced_count = announce.count;
-            for (place, bytes) in announce.replaced[..announce.count].iter_mut().zip(replaced) {
-                *place = u32::from_le_bytes(*bytes);
+        let is_reported = head.flags & AnnounceHead::REPLACED != 0 && replaced.len() >= 4 * count;
+        let mut replaced = replaced.chunks_exact(4).map(pod_read_unaligned::<u32>);
+        for topic in topics.chunks_exact(size_of::<Announced>()).take(MAX_TOPICS) {
+            announce.add(pod_read_unaligned(topic));
+            if let Some(replaced) = replaced.next().filter(|_| is_reported) {
+                announce.add_replaced(replaced.into());
             }
         }
         Some(announce)
     }
 }
-
-const NAME: usize = 32;
-const KIND: usize = 24;
-/// Where the topics begin.
-const TOPICS: usize = 68;
-/// Bytes of a topic.
-const EACH: usize = 8;
-/// The bit of the flags that says that behind the topics stands how many samples of each were replaced.
-const REPLACED: u8 = 1;
-/// More topics than there are.
-const MOST: usize = 16;
-
-const _: () = assert!(Topic::ALL.len() < MOST);
 
 #[cfg(test)]
 mod tests {
@@ -193,6 +190,24 @@ mod tests {
         assert_eq!(Announce::unpack(&room), None, "no sensor has such a name");
         room[8..14].copy_from_slice(b"fron\xFF\0");
         assert_eq!(Announce::unpack(&room), None, "nor such");
+    }
+
+    #[test]
+    fn an_announcement_with_a_mac_fits_into_the_shortest_datagram() {
+        let mut announce = Announce::new(1, "front", "");
+        for topic in 0..100 {
+            announce.add(Announced { topic, ..Announced::default() });
+            announce.add_replaced(topic.into());
+        }
+        let mut room = [0; MTU_LEAST - HEAD - MAC];
+        let len = announce.pack(&mut room).expect("it fits");
+        assert_eq!((announce.topics().len(), announce.replaced(36)), (37, Some(99)));
+        assert_eq!(Announce::unpack(&room[..len]), Some(announce));
+        // A later gateway may announce more.
+        let mut longer = vec![0; 68 + 12 * 255];
+        longer[..68].copy_from_slice(&room[..68]);
+        longer[64] = 255;
+        assert_eq!(Announce::unpack(&longer).map(|announce| announce.topics().len()), Some(37));
     }
 
     #[test]
