@@ -20,6 +20,7 @@ mod docs;
 mod lua;
 mod python;
 mod readers;
+mod recording;
 mod rules;
 
 use std::path::Path;
@@ -96,6 +97,11 @@ fn sizes_are_those_of_the_structs() {
 #[test]
 fn layouts_are_up_to_date() {
     check("tests/vectors/v2/layouts.txt", &Description::read().text());
+}
+
+#[test]
+fn recordings_are_described() {
+    check("schema/src/file/layout.txt", &recording::layout(&Description::read()));
 }
 
 #[test]
