@@ -5,11 +5,10 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use fastrand::Rng;
-use scanhub_drivers::lms::crc::crc;
 use scanhub_drivers::lms::framer::{Found, Framer};
 use scanhub_drivers::lms::header::Expect;
 use scanhub_drivers::lms::measured::{self, Measured};
-use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::telegram::{Telegram, crc};
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_schema::{Contents, Scan};
 use std::hint::black_box;

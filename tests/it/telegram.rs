@@ -4,13 +4,12 @@
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
-use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::command::{Password, Raw, Request, Span, Spans};
 use scanhub_drivers::lms::configuration::{self, Configuration};
-use scanhub_drivers::lms::errors::Errors;
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::operating::{self, Operating};
-use scanhub_drivers::lms::parameters::{Password, Raw, Span, Spans};
 use scanhub_drivers::lms::reply::{self, Health, Reply};
+use scanhub_drivers::lms::status::Errors;
 use scanhub_drivers::lms::telegram::Encoded;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_lms_configure::eeprom::{PowerOn, Write};

@@ -3,14 +3,9 @@
 
 mod arrival;
 mod cadence;
-mod candidates;
 pub mod command;
-pub mod condition;
 pub mod configuration;
-pub mod crc;
-mod damage;
 mod dialogue;
-pub mod errors;
 pub mod exchange;
 pub mod explain;
 pub mod family;
@@ -19,18 +14,14 @@ pub mod header;
 pub mod inquiry;
 pub mod measured;
 pub mod operating;
-mod outgoing;
-pub mod parameters;
 mod probe;
 mod rate;
-pub mod reflectivity;
 pub mod reply;
 mod sensor;
 pub mod session;
 mod start;
-pub mod status_report;
+pub mod status;
 pub mod telegram;
-pub mod value;
 pub mod variant;
 
 pub use dialogue::SILENCE;

@@ -1,9 +1,9 @@
 //! A planned change of the EEPROM settings, and a person's consent to it. A plan is only values. It can be carried out
 //! only with consent, which is for one plan as it was shown.
 
+use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::{Configuration, ITEMS, Item, LEN};
 use scanhub_drivers::lms::inquiry::Report;
-use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::variant::Baud;
 
 use crate::eeprom::PowerOn;

@@ -10,11 +10,10 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
-use scanhub_drivers::lms::command::{self, EEPROM_WRITES, Request};
+use scanhub_drivers::lms::command::{self, EEPROM_WRITES, Password, Request};
 use scanhub_drivers::lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::operating::Operating as Asked;
-use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::reply::{self, Health};
 use scanhub_drivers::lms::telegram::{ACK, Encoded, NAK, REPLY, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};

@@ -42,7 +42,7 @@ fn nobody_writes_the_eeprom() {
             tree.with("hub/drivers/src/lms/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
             tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(
-                "hub/drivers/src/lms/outgoing.rs",
+                "hub/drivers/src/lms/exchange.rs",
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
             tree.with("hub/daemon/src/link.rs", "//! A link.\nuse scanhub_lms_configure::Change;\n"),

@@ -1,10 +1,12 @@
-//! Due times of the scans of a stream.
+//! Losses of a stream: scans that were due and did not arrive, and bytes that were damaged on the line.
 //!
 //! A scanner sends scans one period apart, even if they do not arrive. So lost ones can be counted, and one that was in
 //! a backlog can be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line:
 //! the stream starts again.
 
 use scanhub_schema::{MILLIS, Nanos};
+
+use crate::lms::framer::Tally;
 
 /// Due times of one stream, and counters of all streams of a session.
 #[derive(Clone, Debug)]
@@ -138,6 +140,52 @@ const TOLERANCE: u64 = 6;
 /// A scan that is later than this is lost. A network may delay scans for some tenths of a second.
 const LATEST: Nanos = 1_000 * MILLIS;
 
+/// Damage of all streams of a session.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Damage {
+    /// Number of damaged bytes, up to `seen`.
+    damaged: u64,
+    /// Number of bytes in no telegram when the stream was last checked. `None` without a stream.
+    seen: Option<u64>,
+    /// Time at which bytes were last found damaged.
+    last: Option<Nanos>,
+}
+
+impl Damage {
+    /// Handles the counters of a stream that begins or continues.
+    pub(crate) fn note(&mut self, tally: &Tally, now: Nanos) {
+        let in_nothing = in_nothing(tally);
+        if let Some(seen) = self.seen.replace(in_nothing)
+            && in_nothing > seen
+        {
+            self.damaged += in_nothing - seen;
+            self.last = Some(now);
+        }
+    }
+
+    /// Ends the stream.
+    pub(crate) fn end(&mut self) {
+        self.seen = None;
+    }
+
+    /// Returns the number of damaged bytes, including those since the last check.
+    pub(crate) fn damaged(&self, tally: &Tally) -> u64 {
+        self.damaged + self.seen.map_or(0, |seen| in_nothing(tally) - seen)
+    }
+
+    /// Returns whether a telegram that arrives at `now` may be damaged although its checksum is right.
+    pub(crate) fn is_recent(&self, now: Nanos) -> bool {
+        self.last.is_some_and(|last| now.saturating_sub(last) < RECENT)
+    }
+}
+
+fn in_nothing(tally: &Tally) -> u64 {
+    tally.discarded - tally.broken_off
+}
+
+/// Time for which a line counts as damaging after the last damage.
+const RECENT: Nanos = 10_000 * MILLIS;
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -212,5 +260,21 @@ mod tests {
         (1921..1950).for_each(|n| cadence.note(n * PERIOD / 2, false, PERIOD / 2));
         cadence.rest();
         assert_eq!(cadence.lost(), 0);
+    }
+
+    #[test]
+    fn counts_only_bytes_of_streams() {
+        let tally = |discarded, broken_off| Tally { discarded, broken_off, ..Tally::default() };
+        let mut damage = Damage::default();
+        damage.note(&tally(500, 0), 1);
+        assert_eq!((damage.damaged(&tally(500, 0)), damage.is_recent(1)), (0, false));
+        damage.note(&tally(700, 150), 2);
+        assert_eq!((damage.damaged(&tally(700, 150)), damage.damaged(&tally(720, 150))), (50, 70));
+        assert!(damage.is_recent(2) && damage.is_recent(RECENT + 1) && !damage.is_recent(RECENT + 2));
+        damage.end();
+        assert_eq!(damage.damaged(&tally(900, 150)), 50);
+        damage.note(&tally(900, 150), 3);
+        damage.note(&tally(901, 150), 4);
+        assert_eq!(damage.damaged(&tally(901, 150)), 51);
     }
 }

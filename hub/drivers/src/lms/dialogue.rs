@@ -7,9 +7,9 @@ use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::{self, Control, State};
 use crate::lms::command::{MODE, Request};
+use crate::lms::exchange::{FORGOTTEN, NAK_PAUSE, Outgoing, TRIES};
 use crate::lms::header::{Expect, StreamHeader, is_data};
 use crate::lms::measured::Measured;
-use crate::lms::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing, TRIES};
 use crate::lms::rate::{LineRate, POWER_ON_BAUD, SEARCH_ORDER, SETTLE};
 use crate::lms::reply::{POWER_ON, REFUSED, Reply};
 use crate::lms::sensor::{Identity, Sensor, Trouble};

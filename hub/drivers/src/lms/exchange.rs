@@ -1,14 +1,17 @@
 //! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration
-//! use it.
+//! use [`Exchange`]. A session only uses [`Outgoing`], the request that is being sent, or whose reply is expected.
+//!
+//! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates
+//! (Telegram listing 4.3). So a request is sent byte by byte.
+
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 
 use crate::line::Output;
+use crate::lms::command::Request;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
-pub use crate::lms::outgoing::{MODE_TIMEOUT, MORE_TRIES, Say, TRIES};
-use crate::lms::outgoing::{NAK_PAUSE, Outgoing, SOON};
 use crate::lms::reply::REFUSED;
-use crate::lms::telegram::{REPLY, Telegram};
+use crate::lms::telegram::{Encoded, REPLY, Telegram};
 use crate::lms::variant::Baud;
-use scanhub_schema::Nanos;
 
 /// A line with at most one open request.
 #[derive(Clone, Debug)]
@@ -177,11 +180,223 @@ pub enum Heard {
     Nak,
 }
 
+/// A telegram that has a reply.
+pub trait Say {
+    /// Encodes it for the scanner at `address`.
+    fn encode(&self, address: u8) -> Encoded;
+    /// Returns its command byte.
+    fn command(&self) -> u8;
+    /// Returns the maximum time from the acknowledgment to the reply.
+    fn work(&self) -> Nanos;
+    /// Returns the maximum time to the acknowledgment, or to the first byte of a reply without one.
+    fn sign(&self) -> Nanos {
+        ACKNOWLEDGE_TIMEOUT
+    }
+}
+
+impl Say for Request {
+    fn encode(&self, address: u8) -> Encoded {
+        Request::encode(*self, address)
+    }
+
+    fn command(&self) -> u8 {
+        Request::command(*self)
+    }
+
+    fn work(&self) -> Nanos {
+        match self {
+            Request::Stream | Request::Stop | Request::Baud(_) => MODE_TIMEOUT,
+            _ => REPLY_TIMEOUT,
+        }
+    }
+
+    fn sign(&self) -> Nanos {
+        if *self == Request::Stop { STOP_TIMEOUT } else { ACKNOWLEDGE_TIMEOUT }
+    }
+}
+
+/// The open request.
+#[derive(Clone, Debug)]
+pub(crate) struct Outgoing<R = Request> {
+    pub(crate) request: R,
+    encoded: Encoded,
+    sent: usize,
+    not_before: Nanos,
+    /// Earliest time at which the byte before the next one can have left, see [`Outgoing::restart_if_late`].
+    left_at: Nanos,
+    /// Number of times that the request was started over because a byte was late.
+    restarts: u8,
+    tries: u8,
+    tries_left: u8,
+    /// Additional time for each wait for the acknowledgment.
+    patience: Nanos,
+    acknowledged: bool,
+    /// Whether a byte has arrived since the last one was sent.
+    is_heard: bool,
+    /// Time at which the last byte was sent.
+    out_at: Option<Nanos>,
+    /// End of the wait for the reply, which begins with the last byte.
+    give_up_at: Nanos,
+}
+
+impl<R: Say> Outgoing<R> {
+    /// Creates `request` for the scanner at `address`, to be sent from `not_before` on, at most `tries` times.
+    pub(crate) fn new(request: R, address: u8, not_before: Nanos, tries: u8) -> Self {
+        let encoded = request.encode(address);
+        Outgoing {
+            request,
+            encoded,
+            sent: 0,
+            not_before,
+            left_at: 0,
+            restarts: 0,
+            tries,
+            tries_left: tries - 1,
+            patience: 0,
+            acknowledged: false,
+            is_heard: false,
+            out_at: None,
+            give_up_at: Nanos::MAX,
+        }
+    }
+
+    /// Extends the wait for the acknowledgment by `patience`.
+    pub(crate) fn be_patient(&mut self, patience: Nanos) {
+        self.patience = patience;
+    }
+
+    /// Returns the next byte. Empty if all of them were sent.
+    pub(crate) fn next_byte(&self) -> &[u8] {
+        self.encoded.bytes().get(self.sent..=self.sent).unwrap_or_default()
+    }
+
+    /// Returns the earliest time of the next byte.
+    pub(crate) fn next_at(&self) -> Option<Nanos> {
+        (!self.is_out()).then_some(self.not_before)
+    }
+
+    /// Handles that the next byte was sent at `now`.
+    pub(crate) fn transmitted(&mut self, now: Nanos, baud: Baud) {
+        self.sent += 1;
+        self.not_before = now + line_time(1, baud.rate()) + GAP;
+        if self.sent == self.encoded.bytes().len() {
+            self.out_at = Some(now);
+            // A slow scanner needs a longer wait, not more tries, because each try interrupts the last one.
+            let tried = Nanos::from(self.tries - self.tries_left - 1);
+            self.give_up_at = now + self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
+        }
+    }
+
+    /// Handles that bytes arrived. After the beginning of a scan that the request interrupted, the acknowledgment is
+    /// not detected, only the reply, which may have begun now.
+    pub(crate) fn hear(&mut self, baud: Baud) {
+        if self.is_out() && !core::mem::replace(&mut self.is_heard, true) {
+            self.give_up_at += line_time(1 + LONGEST_REPLY, baud.rate());
+        }
+    }
+
+    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts: a stream at another
+    /// rate looks like endless acknowledgments, which must not extend the deadline again and again.
+    pub(crate) fn acknowledged(&mut self, now: Nanos, baud: Baud) {
+        if core::mem::replace(&mut self.acknowledged, true) {
+            return;
+        }
+        self.give_up_at = now + self.request.work() + line_time(LONGEST_REPLY, baud.rate());
+    }
+
+    /// Begins again, not before `at`. Returns whether there was a try left.
+    pub(crate) fn again(&mut self, at: Nanos) -> bool {
+        self.sent = 0;
+        self.not_before = at;
+        self.acknowledged = false;
+        self.is_heard = false;
+        self.out_at = None;
+        self.give_up_at = Nanos::MAX;
+        self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
+    }
+
+    /// Returns when to call [`Outgoing::again`] if no reply has arrived. Never while the request is being sent.
+    pub(crate) fn give_up_at(&self) -> Nanos {
+        self.give_up_at
+    }
+
+    /// Returns whether the scanner has acknowledged it.
+    pub(crate) fn is_acknowledged(&self) -> bool {
+        self.acknowledged
+    }
+
+    /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
+    /// dropped the request, and it cannot have received its last byte. This does not count as a try. After
+    /// [`MAX_RESTARTS`] the request is sent to its end anyway, so that the wait for its reply ends.
+    pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
+        let is_gap = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
+        self.left_at = now;
+        let is_late = is_gap && self.restarts < MAX_RESTARTS;
+        if is_late {
+            self.restarts += 1;
+            (self.sent, self.not_before) = (0, now + FORGOTTEN);
+        }
+        is_late
+    }
+
+    /// Returns when the last byte was sent. `None` while there are more.
+    pub(crate) fn out_at(&self) -> Option<Nanos> {
+        self.out_at
+    }
+
+    /// Returns the command byte of its reply.
+    pub(crate) fn reply(&self) -> u8 {
+        self.request.command() | REPLY
+    }
+
+    /// Returns whether some of its bytes were sent, but not all.
+    pub(crate) fn is_partly_out(&self) -> bool {
+        self.sent > 0 && !self.is_out()
+    }
+
+    /// Returns whether all of it was sent.
+    pub(crate) fn is_out(&self) -> bool {
+        self.sent >= self.encoded.bytes().len()
+    }
+}
+
+/// Number of tries. A scanner may overlook a request while its mirror rotates. All drivers give it three tries.
+pub const TRIES: u8 = 3;
+/// Number of tries of requests without which there is no stream.
+pub const MORE_TRIES: u8 = 5;
+/// The scanner drops a partial request after 6 ms (Telegram listing 4.3).
+pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
+/// Time from the end of a byte to the next one: more than 55 us, far less than 6 ms (Telegram listing 4.3).
+const GAP: Nanos = 120 * MICROS;
+/// Maximum number of times that a request starts over because a byte was late. A machine that is late more often cannot
+/// send it.
+const MAX_RESTARTS: u8 = 50;
+/// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
+const MOST_GAP: Nanos = 5 * MILLIS;
+/// A byte that may be sent within this time is requested at once. A later one has a deadline like everything else.
+pub(crate) const SOON: Nanos = 5 * MILLIS;
+/// ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin within 100 ms. The rest is for
+/// adapters.
+const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
+/// A captured reply to a stop takes 94 ms, and its acknowledgment is hidden in the stream. Waiting is cheap: a scanner
+/// that overlooked the stop continues to stream.
+const STOP_TIMEOUT: Nanos = 300 * MILLIS;
+/// Captured replies with type, status and configuration take up to 158 ms.
+pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
+/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly 0.1 s. A request for the mode before its end
+/// returns the previous mode, and undoes the change.
+pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
+/// Length of the status reply, in bytes.
+const LONGEST_REPLY: usize = 160;
+/// The scanner requires a pause of 30 ms after a NAK (Telegram listing 4.3).
+pub(crate) const NAK_PAUSE: Nanos = 30 * MILLIS;
+
 #[cfg(test)]
 mod tests {
+    use scanhub_schema::{MILLIS, line_time};
+
     use super::*;
     use crate::lms::command::Request;
-    use scanhub_schema::{MILLIS, line_time};
 
     #[test]
     fn waits_for_a_server_that_packs_the_longest_reply() {
@@ -265,5 +480,28 @@ mod tests {
             }
             assert_eq!(restarts, if behind_server { 0 } else { 50 });
         }
+    }
+
+    #[test]
+    fn bytes_are_sent_with_gaps() {
+        let mut outgoing = Outgoing::new(Request::Status, 0, 5, 2);
+        let mut now = 5;
+        for &expected in Request::Status.encode(0).bytes() {
+            let (byte, not_before) = (outgoing.next_byte()[0], outgoing.next_at().unwrap());
+            assert_eq!(byte, expected);
+            assert!(not_before >= now);
+            now = not_before + 7;
+            outgoing.transmitted(now, Baud::B500000);
+        }
+        assert!(outgoing.is_out());
+        assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT);
+        // The bytes may be the start of the longest reply, which starts once.
+        for _ in 0..2 {
+            outgoing.hear(Baud::B500000);
+            assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));
+        }
+        assert!(outgoing.again(now));
+        assert!(!outgoing.is_out() && outgoing.out_at().is_none());
+        assert!(!outgoing.again(now));
     }
 }

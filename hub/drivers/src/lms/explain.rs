@@ -10,13 +10,11 @@ use crate::lms::command::{
     CARTESIAN, EEPROM_WRITES, MEANS, MODE, RANGE, RANGE_FIELDS, RANGE_MEANS, REFLECTIVITIES, REFLECTIVITY,
     Request, VALUES, VARIANT,
 };
-use crate::lms::condition::Condition;
 use crate::lms::configuration::{self, availability_words};
-use crate::lms::errors::Fault;
 use crate::lms::measured::{COUNT, MEASURED, Measured, PARTIAL};
 use crate::lms::operating;
 use crate::lms::reply::{POWER_ON, REFUSED, RESET, Reply};
-use crate::lms::status_report::{self, Kind};
+use crate::lms::status::{self, Condition, Fault, Kind};
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
@@ -73,7 +71,7 @@ impl<'a> Ranges<'a> {
     }
 
     /// Returns the range of each value in millimeters, or the code that says why it has none.
-    pub fn millimetres(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::value::Code>> + 'a {
+    pub fn millimetres(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::variant::Code>> + 'a {
         let (mode, mm) = (self.mode, u32::from(self.unit.mm()));
         self.raw().map(move |word| mode.split(word).range.map(|range| u32::from(range) * mm))
     }
@@ -487,7 +485,7 @@ fn error_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
 }
 
 fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
-    for item in status_report::ITEMS {
+    for item in status::ITEMS {
         match item.kind {
             Kind::Text => walk.text(item.name, item.len)?,
             Kind::Words => walk.rows(item.name, item.len / 2, &["channel"])?,
@@ -506,7 +504,7 @@ fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
                         "scan angle" => write!(f, "{value} degrees"),
                         "resolution" => write!(f, "{} degrees", Degrees(value as u16)),
                         "permanent rate" => f.write_str(if value == 0 { "9600" } else { "another" }),
-                        "rate of the line" => match status_report::baud_of_divisor(value as u16) {
+                        "rate of the line" => match status::baud_of_divisor(value as u16) {
                             Some(baud) => write!(f, "{} baud", Baud::rate(baud)),
                             None => f.write_str("unknown"),
                         },

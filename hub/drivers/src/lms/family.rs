@@ -122,7 +122,7 @@ const FIELDS_WRITTEN: &[u8] = &[0x40, 0x46];
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lms::parameters::{Span, Spans};
+    use crate::lms::command::{Span, Spans};
 
     #[test]
     fn recognised_from_what_it_says() {

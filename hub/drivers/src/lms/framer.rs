@@ -1,20 +1,19 @@
-//! Finds telegrams in a stream of bytes of which some are missing, without ever throwing away an intact one.
+//! Finds telegrams in a stream of bytes of which some are missing, and never discards an intact one.
 //!
-//! A parser that collects a damaged telegram to its announced length swallows the head of the next one. So nothing
-//! is thrown away here before it was looked at: every position with an acceptable header is a *candidate*, and the
-//! first candidate to complete with a right checksum is the telegram. Because that checksum is weak, such a frame is
-//! *held* while another header begins inside it, or might begin with its last bytes: if that one succeeds, the frame
-//! was wrong. A gap in time may release a held frame; it never drops a byte.
+//! A parser that collects a damaged telegram to its announced length includes the beginning of the next one. So no byte is
+//! discarded here before it was examined: every position with an acceptable header is a *candidate*, and the first
+//! candidate that is complete with a right checksum is the telegram. Because that checksum is weak, such a frame is *held*
+//! while another header begins inside it, or might begin with its last bytes. If that one succeeds, the frame was wrong. A
+//! gap in time may release a held frame, but it never drops a byte.
 //!
-//! Knows no clock and no meaning beyond the header; accounts for every byte: in [`Tally`] always
-//! `read == in_telegrams + acknowledge + discarded + buffered`.
+//! The counters in [`Tally`] include every byte: always `read == in_telegrams + acknowledge + discarded + buffered`.
+
+use scanhub_schema::{MILLIS, Nanos};
 
 use crate::line::suspect;
-use crate::lms::candidates::{Candidate, Candidates};
-use crate::lms::header::{Expect, Judgement, MAX_HEADER, Reject, State, judge};
+use crate::lms::header::{Expect, HEADER_DISTANCE, Judgement, MAX_HEADER, Reject, State, judge};
 use crate::lms::measured::MEASURED;
 use crate::lms::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
-use scanhub_schema::{MILLIS, Nanos};
 
 /// What became of the bytes; every field only grows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -389,3 +388,69 @@ pub(crate) const CAPACITY: usize = 2 * MAX_TELEGRAM;
 pub const VETO_HOLD: Nanos = 14 * MILLIS;
 /// A frame whose last bytes might begin a header is delivered when nothing followed for so long.
 pub const SUFFIX_HOLD: Nanos = 2 * MILLIS;
+
+/// A position with an acceptable header, and where its telegram would end.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Candidate {
+    pub(crate) at: u16,
+    pub(crate) end: u16,
+}
+
+/// The candidates in a full buffer, ascending by position.
+#[derive(Clone, Debug)]
+pub(crate) struct Candidates {
+    list: [Candidate; Candidates::CAPACITY],
+    len: usize,
+}
+
+impl Candidates {
+    const CAPACITY: usize = CAPACITY.div_ceil(HEADER_DISTANCE);
+
+    pub(crate) fn new() -> Self {
+        Candidates { list: [Candidate::default(); Candidates::CAPACITY], len: 0 }
+    }
+
+    fn as_slice(&self) -> &[Candidate] {
+        &self.list[..self.len]
+    }
+
+    pub(crate) fn push(&mut self, at: usize, end: usize) {
+        self.list[self.len] = Candidate { at: at as u16, end: end as u16 };
+        self.len += 1;
+    }
+
+    pub(crate) fn first(&self) -> Option<Candidate> {
+        self.as_slice().first().copied()
+    }
+
+    /// Returns the candidate that is complete first, with bytes up to `end`. If two have the same end, it is the inner
+    /// one, which may refute the outer one.
+    pub(crate) fn first_complete(&self, end: usize) -> Option<Candidate> {
+        let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
+        complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))
+    }
+
+    pub(crate) fn any_before(&self, at: usize) -> bool {
+        self.first().is_some_and(|candidate| usize::from(candidate.at) < at)
+    }
+
+    pub(crate) fn remove(&mut self, candidate: Candidate) {
+        if let Ok(at) = self.as_slice().binary_search_by_key(&candidate.at, |other| other.at) {
+            self.list.copy_within(at + 1..self.len, at);
+            self.len -= 1;
+        }
+    }
+
+    pub(crate) fn drop_before(&mut self, at: usize) {
+        let gone = self.as_slice().partition_point(|candidate| usize::from(candidate.at) < at);
+        self.list.copy_within(gone..self.len, 0);
+        self.len -= gone;
+    }
+
+    pub(crate) fn shift(&mut self, by: usize) {
+        for candidate in &mut self.list[..self.len] {
+            candidate.at -= by as u16;
+            candidate.end -= by as u16;
+        }
+    }
+}

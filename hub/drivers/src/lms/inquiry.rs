@@ -5,24 +5,22 @@
 //! rate, in two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more
 //! often.
 
+use scanhub_schema::{Nanos, line_time};
+
 use crate::line::family::table;
 use crate::line::{Output, Protocol};
 use crate::lms::command::Request;
-use crate::lms::condition::Condition;
 use crate::lms::configuration::Configuration;
 use crate::lms::dialogue::LISTEN;
-use crate::lms::errors::Errors;
-use crate::lms::exchange::{Exchange, Heard};
+use crate::lms::exchange::{Exchange, Heard, TRIES};
 use crate::lms::family::Family;
 use crate::lms::framer::{Tally, TelegramSpan};
 use crate::lms::header::is_data;
-use crate::lms::outgoing::TRIES;
 use crate::lms::rate::SETTLE;
 use crate::lms::reply::Reply;
-use crate::lms::status_report::{DIRTY, StatusReport};
+use crate::lms::status::{Condition, DIRTY, Errors, StatusReport};
 use crate::lms::telegram::{Encoded, MAX_TELEGRAM, REPLY};
 use crate::lms::variant::Baud;
-use scanhub_schema::{Nanos, line_time};
 
 /// Progress of an inquiry.
 #[derive(Clone, Debug)]

@@ -1,7 +1,7 @@
 //! Operating modes: what follows command 20h. The two that every conversation needs, and the rates, are requests of
 //! their own; all others are here.
 
-use crate::lms::parameters::{Password, Raw, Span, Spans};
+use crate::lms::command::{Password, Raw, Span, Spans};
 use crate::lms::telegram::Writer;
 use crate::lms::variant::Baud;
 

@@ -1,17 +1,16 @@
 //! Replies: what a sensor says to a host's requests, and unasked in a stream. Every reply ends with a status byte, which
-//! is [`crate::lms::condition::Condition`]'s affair, not this file's.
+//! is [`crate::lms::status::Condition`]'s affair, not this file's.
 
 use crate::lms::command as request;
+use crate::lms::command::Span;
 use crate::lms::configuration::factory;
-use crate::lms::errors::Errors;
-use crate::lms::measured::{MEASURED, Measured};
-use crate::lms::parameters::Span;
-use crate::lms::reflectivity::{RangeFields, Reflectivities, Reflectivity};
+use crate::lms::measured::{MEASURED, Measured, RangeFields, Reflectivities, Reflectivity};
+use crate::lms::status::Errors;
 use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
 use crate::lms::variant::{Mode, Unit, Variant};
 
 pub use crate::lms::configuration::Configuration;
-pub use crate::lms::status_report::{Health, StatusReport, status};
+pub use crate::lms::status::{Health, StatusReport, status};
 
 /// A reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

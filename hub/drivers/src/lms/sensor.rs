@@ -1,16 +1,16 @@
 //! State of a scanner as far as it has reported it, for messages and for the next session. It is discarded when the
 //! next telegram may come from another scanner.
 
+use core::fmt;
+
 use crate::line;
 use crate::lms::command::Request;
-use crate::lms::condition::{Condition, Severity};
 use crate::lms::family::Family;
 use crate::lms::header::StreamHeader;
 use crate::lms::reply::{POWER_ON, Reply};
-use crate::lms::status_report::{DIRTY, StatusReport};
+use crate::lms::status::{Condition, DIRTY, Severity, StatusReport};
 use crate::lms::telegram::Telegram;
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
-use core::fmt;
 
 /// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -396,7 +396,7 @@ const ON_REQUEST: u8 = 0x25;
 mod tests {
     use super::*;
     use crate::lms::command::STATUS;
-    use crate::lms::status_report::Health;
+    use crate::lms::status::Health;
     use crate::lms::telegram::{REPLY, Writer};
 
     #[test]

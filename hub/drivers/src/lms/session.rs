@@ -1,24 +1,23 @@
 //! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
 
-use crate::line::family;
+use scanhub_schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
+
 use crate::line::{
-    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, suspect,
+    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, family, suspect,
 };
 use crate::lms::arrival::{Arrivals, Rhythm, Stamp};
-use crate::lms::cadence::Cadence;
-use crate::lms::damage::Damage;
+use crate::lms::cadence::{Cadence, Damage};
 use crate::lms::dialogue::Dialogue;
+use crate::lms::exchange::{Outgoing, SOON};
 use crate::lms::family::Family;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::lms::header::Reject;
 use crate::lms::measured::{FirstValues, MEASURED, nominal_period};
-use crate::lms::outgoing::{Outgoing, SOON};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::{Sensor, Trouble};
 use crate::lms::telegram::{MAX_TELEGRAM, Telegram};
 use crate::lms::variant::{BYTES_PER_TURN, Baud, MAX_BEAMS, Mode, Unit, Variant};
 use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
-use scanhub_schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
 
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,7 +4,7 @@
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::lms::command::Request;
-use crate::lms::outgoing::{MORE_TRIES, TRIES};
+use crate::lms::exchange::{MORE_TRIES, TRIES};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};

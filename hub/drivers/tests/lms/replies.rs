@@ -1,13 +1,11 @@
 //! Every reply both ways: those that are printed or captured, and those that the layout alone gives. What the documents
 //! print wrong is refused by its checksum.
 
-use scanhub_drivers::lms::condition::Condition;
+use scanhub_drivers::lms::command::Span;
 use scanhub_drivers::lms::configuration::Configuration;
-use scanhub_drivers::lms::errors::Errors;
-use scanhub_drivers::lms::measured::{self, Frame, Measured};
-use scanhub_drivers::lms::parameters::Span;
-use scanhub_drivers::lms::reflectivity::RangeFields;
+use scanhub_drivers::lms::measured::{self, Frame, Measured, RangeFields};
 use scanhub_drivers::lms::reply::{self, Reply};
+use scanhub_drivers::lms::status::{Condition, Errors};
 use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 

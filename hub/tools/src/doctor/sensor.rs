@@ -3,10 +3,9 @@
 
 use scanhub_config::Link;
 use scanhub_drivers::line::{Condition as ReportedHealth, Introduction};
-use scanhub_drivers::lms::condition::{Condition, Severity};
-use scanhub_drivers::lms::errors::Fault;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::status::{Condition, Fault, Severity};
 use scanhub_drivers::lms::variant::Variant;
 use scanhub_port::Holder;
 use scanhub_schema::{State, Status};
@@ -317,7 +316,7 @@ const MAX_LOSS: u64 = 100;
 #[cfg(test)]
 mod tests {
     use scanhub_drivers::line::{Account, Output, Protocol as _};
-    use scanhub_drivers::lms::status_report::Health;
+    use scanhub_drivers::lms::status::Health;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
     use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
     use scanhub_drivers::lms::{Inquiry, configuration};

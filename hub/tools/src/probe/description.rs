@@ -4,11 +4,11 @@
 use std::fmt;
 
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::condition::Condition;
 use scanhub_drivers::lms::configuration::availability_words;
 use scanhub_drivers::lms::family::Family as Type;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::status::Condition;
 use scanhub_drivers::lms::variant::Mode;
 use scanhub_drivers::{Model, Report, features, lms};
 use scanhub_schema::{Family, Status};
@@ -99,7 +99,7 @@ impl Description {
         let variant = status.and_then(|status| status.variant());
         let condition = report.status_byte.map(Condition);
         let configuration = report.configuration();
-        let faults = |fault: lms::errors::Fault| Fault {
+        let faults = |fault: lms::status::Fault| Fault {
             severity: fault.severity().map(|severity| severity.name()),
             number: fault.number,
             past: fault.is_past(),

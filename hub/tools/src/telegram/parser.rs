@@ -3,10 +3,9 @@
 
 use std::io;
 
-use scanhub_drivers::lms::crc::crc;
 use scanhub_drivers::lms::explain::name;
 use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
-use scanhub_drivers::lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram};
+use scanhub_drivers::lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram, crc};
 
 /// A part of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -3,9 +3,9 @@
 
 use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::factory;
 use scanhub_drivers::lms::framer::Tally;
-use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::telegram::{FRAME, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use scanhub_lms_configure::{Change, Consent, OwnedConfiguration, Plan};

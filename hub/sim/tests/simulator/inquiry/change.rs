@@ -2,8 +2,8 @@
 //! known when it goes wrong.
 
 use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::command::Password;
 use scanhub_drivers::lms::configuration::Configuration;
-use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::telegram::{NAK, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use scanhub_lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};

@@ -1,8 +1,7 @@
 //! Bad quirks of a sensor, each alone.
 
-use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::command::{Password, Request};
 use scanhub_drivers::lms::operating::Operating;
-use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::{ACK, NAK};
 use scanhub_drivers::lms::variant::{Baud, Variant};

@@ -2,7 +2,7 @@
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Notice;
-use scanhub_drivers::lms::condition::Condition;
+use scanhub_drivers::lms::status::Condition;
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_schema::MILLIS;
 use scanhub_sim::machine::{Settings, Start};
@@ -84,7 +84,7 @@ fn whole_scans(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> ToHost {
 fn dirty(mut scan: Vec<u8>, is_dirty: bool) -> Vec<u8> {
     if is_dirty {
         scan[729] |= 0x80;
-        let sum = lms::crc::crc(&scan[..730]).to_le_bytes();
+        let sum = lms::telegram::crc(&scan[..730]).to_le_bytes();
         scan[730..].copy_from_slice(&sum);
     }
     scan

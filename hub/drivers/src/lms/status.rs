@@ -1,8 +1,106 @@
-//! The sensor's long account of itself, B1h: 152 bytes of settings and health (Telegram listing 7-5, offsets checked
-//! against a real one).
+//! Health of a scanner as it reports it: the status byte that ends every reply, the long status B1h, and the errors of B2h
+//! (Telegram listing 7-5, 7-18, 8 and 9).
+//!
+//! The same scanner sends the status byte 10h on one day and 11h on the next, so only its bits have a meaning. The offsets
+//! in the long status were checked against a real scanner.
+
+use core::fmt;
 
 use crate::lms::telegram::{Encoded, REPLY, Writer};
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
+
+/// A status byte.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Condition(pub u8);
+
+impl Condition {
+    /// A healthy LMS type 6.
+    pub const OK: Condition = Condition(0x10);
+
+    /// How bad it is; `None` for codes without a meaning.
+    pub fn severity(self) -> Option<Severity> {
+        Severity::of_code(self.0 & 7)
+    }
+
+    /// Whether the sensor calls itself an LMS type 6; else it is another or a special device.
+    pub fn is_type_6(self) -> bool {
+        self.0 >> 3 & 3 == 0b10
+    }
+
+    /// Whether the restart input is high.
+    pub fn restart_input(self) -> bool {
+        self.0 & 0x20 != 0
+    }
+
+    /// Whether the sensor finds its own values implausible.
+    pub fn is_implausible(self) -> bool {
+        self.0 & 0x40 != 0
+    }
+
+    /// Whether the window is dirty.
+    pub fn is_polluted(self) -> bool {
+        self.0 & 0x80 != 0
+    }
+}
+
+impl fmt::Display for Condition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.severity() {
+            Some(severity) => f.write_str(severity.name())?,
+            None => write!(f, "severity {}", self.0 & 7)?,
+        }
+        let flags = [
+            (!self.is_type_6(), "no LMS of type 6"),
+            (self.restart_input(), "restart input high"),
+            (self.is_implausible(), "implausible values"),
+            (self.is_polluted(), "window polluted"),
+        ];
+        for (_, words) in flags.iter().filter(|(is_set, _)| *is_set) {
+            write!(f, ", {words}")?;
+        }
+        Ok(())
+    }
+}
+
+/// How bad a condition or an error is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// Nothing to say.
+    Ok,
+    /// For information.
+    Info,
+    /// The sensor works, for now.
+    Warning,
+    /// It does not work right.
+    Error,
+    /// It does not work.
+    Fatal,
+}
+
+impl Severity {
+    /// The severity of code 0 to 4.
+    pub fn of_code(code: u8) -> Option<Severity> {
+        [Severity::Ok, Severity::Info, Severity::Warning, Severity::Error, Severity::Fatal]
+            .get(usize::from(code))
+            .copied()
+    }
+
+    /// Its code.
+    pub fn code(self) -> u8 {
+        self as u8
+    }
+
+    /// In a word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Severity::Ok => "ok",
+            Severity::Info => "info",
+            Severity::Warning => "warning",
+            Severity::Error => "error",
+            Severity::Fatal => "fatal",
+        }
+    }
+}
 
 /// Data of a status reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -251,10 +349,116 @@ const CHANNELS: usize = 8;
 /// LENGTH 9Ah less command and status (Telegram listing 7-5).
 pub const LEN: usize = 152;
 
+/// The errors of a reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Errors<'a>(&'a [u8]);
+
+impl<'a> Errors<'a> {
+    /// The pairs that `bytes` are; `None` if one is cut.
+    pub fn new(bytes: &'a [u8]) -> Option<Errors<'a>> {
+        bytes.len().is_multiple_of(2).then_some(Errors(bytes))
+    }
+
+    /// The bytes as they came.
+    pub fn bytes(&self) -> &'a [u8] {
+        self.0
+    }
+
+    /// In the order in which the sensor tells them.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = Fault> + Clone + 'a {
+        self.0.chunks_exact(2).map(|pair| Fault { kind: pair[0], number: pair[1] })
+    }
+}
+
+/// One error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault {
+    /// Its type: the severity, and 80h if it is past.
+    pub kind: u8,
+    /// Its number.
+    pub number: u8,
+}
+
+impl Fault {
+    /// How bad it is; `None` for codes without a meaning.
+    pub fn severity(self) -> Option<Severity> {
+        Severity::of_code(self.kind & !PAST)
+    }
+
+    /// Whether it is over, and only kept in memory; 10h clears it.
+    pub fn is_past(self) -> bool {
+        self.kind & PAST != 0
+    }
+
+    /// What its number means; `None` for one that is not known here.
+    pub fn meaning(self) -> Option<&'static str> {
+        Some(match self.number {
+            5 => "dazzled",
+            6 | 7 => "comparator",
+            15 => "time measurement (TDC)",
+            17 | 20 => "oil on the window",
+            18 | 19 => "dirt on the window",
+            21 | 22 => "reference of the pollution measurement",
+            27 | 28 => "switching outputs",
+            29 => "motor revolutions",
+            37 => "calibration of the pollution measurement",
+            45 => "a value is missing",
+            46 => "a scan is missing",
+            47 => "reference target",
+            48 | 49 => "laser power",
+            53 => "FLASH written",
+            56 => "watchdog",
+            57 => "no zero index",
+            58..=61 => "synchronisation of two sensors",
+            62 => "DIP switches",
+            86..=92 => "reference target",
+            124..=126 => "memory",
+            _ => return None,
+        })
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.is_past() { "past " } else { "" })?;
+        match self.severity() {
+            Some(severity) => f.write_str(severity.name())?,
+            None => write!(f, "type {:02X}", self.kind & !PAST)?,
+        }
+        write!(f, " {}", self.number)?;
+        match self.meaning() {
+            Some(meaning) => write!(f, ": {meaning}"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Added to the type of an error that is over.
+const PAST: u8 = 0x80;
+
 #[cfg(test)]
 mod tests {
+    use std::string::ToString;
+    use std::vec::Vec;
+
     use super::*;
     use crate::lms::telegram::Telegram;
+
+    #[test]
+    fn every_bit_has_its_word() {
+        for (byte, words) in [
+            (0x10, "ok"),
+            (0x11, "info"),
+            (0x92, "warning, window polluted"),
+            (0x53, "error, implausible values"),
+            (0x34, "fatal, restart input high"),
+            (0x18, "ok, no LMS of type 6"),
+            (0x15, "severity 5"),
+        ] {
+            assert_eq!(Condition(byte).to_string(), words);
+        }
+        assert!((0..5).all(|code| Severity::of_code(code).unwrap().code() == code));
+    }
 
     #[test]
     fn items_leave_no_gap() {
@@ -288,5 +492,22 @@ mod tests {
             assert_eq!((report.pollution(), report.laser_power_percent()), ([0; 12], 0));
         }
         assert_eq!(StatusReport::new(&[0; 151]), None);
+    }
+
+    #[test]
+    fn a_captured_list() {
+        // B2 84 16 (84 31)x8 84 16 01 31, less the eight.
+        let errors = Errors::new(&[0x84, 0x16, 0x84, 0x31, 1, 0x31]).unwrap();
+        let words: Vec<_> = errors.iter().map(|fault| fault.to_string()).collect();
+        assert_eq!(
+            words,
+            [
+                "past fatal 22: reference of the pollution measurement",
+                "past fatal 49: laser power",
+                "info 49: laser power"
+            ]
+        );
+        assert_eq!(Errors::new(&[1]), None);
+        assert_eq!(Fault { kind: 0x7F, number: 1 }.to_string(), "type 7F 1");
     }
 }
