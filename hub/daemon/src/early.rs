@@ -97,7 +97,7 @@ const _: () = assert!((Verdict::Slow as u8) < Verdict::Stop as u8);
 #[cfg(test)]
 mod tests {
     use fastrand::Rng;
-    use scanhub_drivers::line::grid::{NO_RETURN, Point};
+    use scanhub_drivers::line::{NO_RETURN, Point};
     use scanhub_drivers::line::{Values, revolution_head};
     use scanhub_preprocess::zones::{Sector, Settings};
     use scanhub_schema::{Family, Pose, Zones};

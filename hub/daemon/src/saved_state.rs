@@ -14,8 +14,8 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_config::{Config, Link};
+use scanhub_drivers::line::BEAMS;
 pub use scanhub_drivers::line::KnownRate;
-use scanhub_drivers::line::grid::BEAMS;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{Model, features};
 use scanhub_port::{Source, clock};

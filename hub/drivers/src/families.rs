@@ -2,8 +2,8 @@
 
 use std::fmt;
 
+use crate::line::family::Probe;
 use crate::line::family::{Features, Model};
-use crate::line::probe::Probe;
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
@@ -224,10 +224,3 @@ const _: () = {
         at += 1;
     }
 };
-const _: () = assert!(
-    line::suspect::LINE_ERROR == scanhub_schema::Reasons::LINE_ERROR
-        && line::suspect::NEIGHBOUR == scanhub_schema::Reasons::NEIGHBOUR
-        && line::suspect::SLOW == scanhub_schema::Reasons::SLOW
-        && line::suspect::FORBIDDEN_BITS == scanhub_schema::Reasons::FORBIDDEN_BITS
-        && line::suspect::HEADER_INSIDE == scanhub_schema::Reasons::HEADER_INSIDE
-);

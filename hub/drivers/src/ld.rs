@@ -1,17 +1,185 @@
-//! LDROBOT LD06, LD19, STL19P, STL27L and LD14P: the framer, packets, revolutions, and the session with a scanner that streams
-//! without a request. Nothing is ever sent to it.
+//! LDROBOT LD06, LD19, STL19P, STL27L and LD14P, which stream without a request. Nothing is ever sent to them.
+//!
+//! Here is what the family declares: its models, its settings, and its recognizer.
 
-pub mod framer;
-mod model;
 pub mod packet;
 mod point_count;
-mod probe;
-mod restarts;
 mod sequence;
 mod session;
 
+use scanhub_schema::{Family, MILLIS, Nanos};
+
+use crate::ld::packet::{Framer, LEN, Packet};
+use crate::ld::sequence::{Place, Sequence};
+use crate::line::family::{Approach, Evidence, Listen};
+use crate::settings::Settings;
+
 pub use crate::line::{Tally, TurnCounts};
-pub use model::Model;
-pub use probe::Probe;
 pub use session::{FEATURES, Session, Trouble};
 pub(crate) use session::{check, scan_heads};
+
+/// A scanner of the family.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Model {
+    /// LD06.
+    Ld06,
+    /// LD19, also sold in the kit D500.
+    Ld19,
+    /// STL19P.
+    Stl19p,
+    /// STL27L.
+    Stl27l,
+    /// LD14P, whose head turns slower.
+    Ld14p,
+}
+
+impl Model {
+    /// All of them.
+    pub const ALL: [Model; 5] = [Model::Ld06, Model::Ld19, Model::Stl19p, Model::Stl27l, Model::Ld14p];
+
+    /// Its name in configuration and words.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Model::Ld06 => "ld06",
+            Model::Ld19 => "ld19",
+            Model::Stl19p => "stl19p",
+            Model::Stl27l => "stl27l",
+            Model::Ld14p => "ld14p",
+        }
+    }
+
+    /// The model of this name.
+    pub fn named(name: &str) -> Option<Model> {
+        Model::ALL.into_iter().find(|model| model.name() == name)
+    }
+
+    /// Returns the model of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Model> {
+        settings.model.and_then(Model::named)
+    }
+
+    /// The rate at which it speaks, in bits per second.
+    pub const fn baud(self) -> u32 {
+        match self {
+            Model::Stl27l => 921_600,
+            _ => 230_400,
+        }
+    }
+
+    /// Points that it measures in a second, whatever the speed of its head.
+    pub const fn points_per_second(self) -> u32 {
+        match self {
+            Model::Stl27l => 21_600,
+            Model::Ld14p => 4_000,
+            _ => 4_500,
+        }
+    }
+
+    /// Turns in a second, as it comes out of its box.
+    pub const fn turns_per_second(self) -> u32 {
+        match self {
+            Model::Ld14p => 6,
+            _ => 10,
+        }
+    }
+
+    /// Beams of a turn unless something else is asked for: chosen by measurement (docs/scanners.md).
+    pub const fn beams(self) -> usize {
+        match self {
+            Model::Stl27l => 2_160,
+            Model::Ld14p => 666,
+            _ => 450,
+        }
+    }
+
+    /// The model that measures so many points in a second; of those that cannot be told apart, the best known one.
+    pub(crate) fn of_point_rate(points_per_second: f32) -> Model {
+        match points_per_second {
+            rate if rate > 10_000.0 => Model::Stl27l,
+            rate if (3_600.0..4_250.0).contains(&rate) => Model::Ld14p,
+            _ => Model::Ld19,
+        }
+    }
+}
+
+/// Recognizer of LDROBOT packets.
+#[derive(Clone, Debug)]
+pub struct Probe {
+    framer: Framer,
+    sequence: Sequence,
+    /// Packets in sequence.
+    packets: u32,
+}
+
+impl Default for Probe {
+    fn default() -> Self {
+        Probe { framer: Framer::default(), sequence: Sequence::new(), packets: 0 }
+    }
+}
+
+impl Probe {
+    /// Counts the packets in the framer that continue each other.
+    fn count(&mut self) {
+        while let Some(span) = self.framer.advance(1) {
+            let packet = self.framer.bytes(span).first_chunk().and_then(|bytes| Packet::check(bytes).ok());
+            match packet.map(|packet| self.sequence.place(&packet)) {
+                Some(Place::First { .. }) => self.packets = 1,
+                Some(Place::Next { .. }) => self.packets += 1,
+                Some(Place::Again | Place::Odd) | None => {}
+            }
+        }
+    }
+}
+
+impl crate::line::family::Probe for Probe {
+    fn approach(&self) -> &'static Approach {
+        &APPROACH
+    }
+
+    fn clear(&mut self) {
+        *self = Probe::default();
+    }
+
+    fn receive(&mut self, mut bytes: &[u8]) {
+        while !bytes.is_empty() {
+            let spare = self.framer.spare();
+            let len = spare.len().min(bytes.len());
+            spare[..len].copy_from_slice(&bytes[..len]);
+            self.framer.commit(len);
+            bytes = &bytes[len..];
+            self.count();
+        }
+    }
+
+    fn hold(&self) -> Option<Nanos> {
+        self.framer.hold()
+    }
+
+    fn release(&mut self, idle: Nanos) {
+        self.framer.release(idle);
+        self.count();
+    }
+
+    fn evidence(&self) -> Evidence {
+        match self.packets {
+            0 => Evidence::None,
+            1..PROOF => Evidence::Begun,
+            _ => Evidence::Found(None),
+        }
+    }
+}
+
+const APPROACH: Approach = Approach {
+    family: Family::Ld,
+    listens: &[
+        Listen { rate: Model::Ld19.baud(), span: 150 * MILLIS, needs_bytes: false },
+        Listen { rate: Model::Stl27l.baud(), span: 100 * MILLIS, needs_bytes: true },
+    ],
+    asks: None,
+    boot_rate: None,
+    max_transmission: LEN,
+    advice: "it streams by itself once it has 5 V and its head rotates",
+};
+/// Packets in sequence that prove an LDROBOT. Each has a header and a checksum of 24 bits, and its angles and its clock have
+/// to continue those of the packet before.
+const PROOF: u32 = 4;

@@ -5,37 +5,37 @@
 mod arrival;
 pub mod family;
 pub mod framing;
-pub mod grid;
-pub mod probe;
-mod reads;
 mod scan;
 mod sensor_clock;
 mod session;
 mod stream;
 mod turns;
 
+use scanhub_schema::Reasons;
+
 pub use arrival::{Arrivals, Flow};
 pub use framing::{Buffer, Tally};
-pub use reads::Reads;
-pub use scan::{RawScan, Values, revolution_head};
+pub use scan::{BEAMS, Grid, NO_RETURN, NOT_MEASURED, Point, RawScan, Values, revolution_head};
 pub use sensor_clock::SensorClock;
 pub use session::{
     Account, Condition, Control, Event, Identity, Introduction, KnownRate, Notice, Output, Protocol,
     Received, Session, State, Whole,
 };
-pub use stream::{StreamCounters, Watchdog};
+pub use stream::{Reads, StreamCounters, Watchdog};
 pub use turns::{Closed, Pace, TurnCounts, Turns};
 
 /// Reasons why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
 pub mod suspect {
+    use super::Reasons;
+
     /// The error counters of the line have increased.
-    pub const LINE_ERROR: u8 = 1;
+    pub const LINE_ERROR: u8 = Reasons::LINE_ERROR;
     /// The bytes before it belonged to nothing: its neighbor was damaged.
-    pub const NEIGHBOUR: u8 = 2;
+    pub const NEIGHBOUR: u8 = Reasons::NEIGHBOUR;
     /// It took longer than usual.
-    pub const SLOW: u8 = 4;
+    pub const SLOW: u8 = Reasons::SLOW;
     /// Bits are set that no scanner sets.
-    pub const FORBIDDEN_BITS: u8 = 8;
+    pub const FORBIDDEN_BITS: u8 = Reasons::FORBIDDEN_BITS;
     /// Another acceptable header began inside it.
-    pub const HEADER_INSIDE: u8 = 16;
+    pub const HEADER_INSIDE: u8 = Reasons::HEADER_INSIDE;
 }

@@ -1,5 +1,7 @@
-//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator is the second
-//! user of the protocol, so requests are decoded and replies are encoded here, too.
+//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator also uses the
+//! protocol, so requests are decoded and replies are encoded here, too.
+//!
+//! Here is what the family declares: its settings, and its recognizer.
 
 mod arrival;
 mod cadence;
@@ -14,7 +16,6 @@ pub mod header;
 pub mod inquiry;
 pub mod measured;
 pub mod operating;
-mod probe;
 mod rate;
 pub mod reply;
 mod sensor;
@@ -24,10 +25,238 @@ pub mod status;
 pub mod telegram;
 pub mod variant;
 
+use scanhub_schema::{Contents, Family, MICROS, MILLIS, Nanos, ScanHead};
+
+use crate::line::family::{Approach, Asks, Evidence, Features, Listen, Model};
+use crate::lms::family::Family as Type;
+use crate::lms::framer::{Advance, Framer};
+use crate::lms::header::{Reject, State};
+use crate::lms::reply::Reply;
+use crate::lms::telegram::MAX_TELEGRAM;
+use crate::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
+use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
+
 pub use dialogue::SILENCE;
 pub use inquiry::Inquiry;
-pub use probe::Probe;
 pub use sensor::{Notice, Sensor, Trouble};
-pub(crate) use session::scan_heads;
-pub use session::{FEATURES, Session, Settings};
-pub(crate) use session::{check, set};
+pub use session::{Session, Settings};
+
+/// Recognizer of LMS telegrams.
+#[derive(Clone, Debug, Default)]
+pub struct Probe {
+    framer: Framer,
+    is_found: bool,
+    /// Whether the scanner has acknowledged the request, and nothing has arrived since.
+    is_acknowledged: bool,
+}
+
+impl Probe {
+    fn check(&mut self) {
+        while let Some(found) = self.framer.advance() {
+            self.is_acknowledged = false;
+            match found {
+                Advance::Telegram(span) => {
+                    self.is_found |= Reply::decode(self.framer.view(span).telegram).is_some();
+                }
+                Advance::Ack => self.is_acknowledged = true,
+                Advance::Nak => {}
+            }
+        }
+    }
+}
+
+impl crate::line::family::Probe for Probe {
+    fn approach(&self) -> &'static Approach {
+        &APPROACH
+    }
+
+    fn clear(&mut self) {
+        *self = Probe::default();
+    }
+
+    fn expect_reply(&mut self, is_expected: bool) {
+        self.framer.await_acknowledge(is_expected);
+        self.is_acknowledged = false;
+    }
+
+    fn receive(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.framer.spare()[0] = *byte;
+            self.framer.commit(1);
+            self.is_acknowledged = false;
+            self.check();
+        }
+    }
+
+    fn hold(&self) -> Option<Nanos> {
+        self.framer.hold()
+    }
+
+    fn release(&mut self, idle: Nanos) {
+        self.framer.release(idle);
+        self.check();
+    }
+
+    fn evidence(&self) -> Evidence {
+        let is_begun = matches!(self.framer.state(), State::Body | State::Crc);
+        if self.is_found {
+            Evidence::Found(None)
+        } else if is_begun || self.is_acknowledged {
+            Evidence::Begun
+        } else if self.framer.tally().rejected[Reject::Crc as usize] > 0 {
+            Evidence::Damaged
+        } else {
+            Evidence::None
+        }
+    }
+}
+
+const APPROACH: Approach = Approach {
+    family: Family::Lms,
+    // Only at this rate does a listening step contain several telegrams of a stream.
+    listens: &[Listen { rate: 500_000, span: 120 * MILLIS, needs_bytes: true }],
+    asks: Some(Asks {
+        // At power-on, after a hub, and the rest.
+        rates: &[9_600, 500_000, 38_400, 19_200],
+        settle: 20 * MILLIS,
+        stop: None,
+        requests: &[
+            &[0x02, 0x00, 0x01, 0x00, command::TYPE, 0x1E, 0x12],
+            &[0x02, 0x00, 0x01, 0x00, command::STATUS, 0x15, 0x12],
+        ],
+        // At least 55 us and at most 6 ms (Telegram listing 4.3), less the time of the write.
+        gap: Some((120 * MICROS, 5 * MILLIS)),
+        // The acknowledgement arrives within 60 ms (Telegram listing 4.3), and captured replies began within 150 ms.
+        reply: 150 * MILLIS,
+        patience: 250 * MILLIS,
+        // The rest of the captured times, and a status at 9,600 baud.
+        extension: 300 * MILLIS,
+        repeats: 1,
+    }),
+    // Without another setting in its EEPROM, the scanner starts at this rate (Telegram listing 7.1).
+    boot_rate: Some(9_600),
+    max_transmission: MAX_TELEGRAM,
+    advice: "RS-422 needs jumper 7-8, and after power-on it takes up to a minute",
+};
+
+const _: () = assert!(Baud::ALL.len() == 4);
+
+/// Models and settings of the family.
+pub const FEATURES: Features = Features {
+    models: &[],
+    auto: Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
+    modes: &[],
+    keys: &[Key::Type, Key::Angle, Key::Resolution, Key::Unit, Key::ModeNumber, Key::Baud],
+    can_rest: false,
+    speaks_unasked: false,
+    has_whole_telegrams: true,
+    has_inquiry: true,
+    contents: Contents::UPPER,
+    max_telegram: MAX_TELEGRAM,
+};
+
+/// Sets a `key` that only an LMS has.
+pub(crate) fn set(request: &mut SettingsRequest, key: Key, value: Value<'_>) -> Result<(), Refusal> {
+    match (key, value) {
+        (Key::Type, Value::Text(name)) => {
+            let family = Type::of_name(name)
+                .ok_or_else(|| refused(Key::Type, value, "lms200, lms211, lms221 or lms291"))?;
+            request.expected_type = Some(family.name());
+        }
+        (Key::Angle, Value::Number(angle)) => {
+            let known = Variant::ALL.map(|variant| variant.angle_deg);
+            let known = known.into_iter().find(|&deg| f64::from(deg) == angle);
+            request.angle_deg = Some(known.ok_or_else(|| refused(Key::Angle, value, "100 or 180"))?);
+        }
+        (Key::Resolution, Value::Number(step)) => {
+            let known = Variant::ALL.map(|variant| variant.resolution_cdeg);
+            let known = known.into_iter().find(|&cdeg| f64::from(cdeg) == step * 100.0);
+            request.resolution_cdeg =
+                Some(known.ok_or_else(|| refused(Key::Resolution, value, "0.25, 0.5 or 1"))?);
+        }
+        (Key::Unit, Value::Text("mm")) => request.unit_mm = Some(Unit::Mm.mm()),
+        (Key::Unit, Value::Text("cm")) => request.unit_mm = Some(Unit::Cm.mm()),
+        (Key::Unit, _) => return Err(refused(Key::Unit, value, "\"mm\" or \"cm\"")),
+        (Key::Baud, Value::Whole(rate)) => {
+            const REMEDY: &str =
+                "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's";
+            let known = u32::try_from(rate).ok().and_then(Baud::of_rate);
+            request.baud = Some(known.ok_or_else(|| refused(Key::Baud, value, REMEDY))?.rate());
+        }
+        (Key::ModeNumber, _) => {
+            let number = if let Value::Whole(number) = value { u8::try_from(number).ok() } else { None };
+            let known = number.filter(|&number| Mode(number).has_ranges());
+            request.mode_number = Some(known.ok_or_else(|| refused(Key::ModeNumber, value, MODES))?);
+            request.mode = None;
+        }
+        _ => return Err(refused(key, value, "a value of another kind")),
+    }
+    Ok(())
+}
+
+/// Returns the settings of an LMS.
+pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Refusal> {
+    if let Some(model) = &request.model {
+        let what = format!("model = \"{model}\", but a scanner of family lms reports its model");
+        return Err(Refusal::new(&[Key::Model], what, "leave it out; `type` is the expected model"));
+    }
+    if let Some(beams) = request.beams {
+        let what = format!("beams = {beams}, and an lms has its own");
+        return Err(Refusal::new(&[Key::Beams], what, "leave it out; `angle` and `resolution` say how many"));
+    }
+    if let Some(mode) = &request.mode {
+        return Err(Refusal::new(&[Key::ModeName], format!("mode = \"{mode}\""), MODES));
+    }
+    let family = request.expected_type.and_then(Type::of_name);
+    let factory = family.and_then(Type::factory_variant).unwrap_or(Variant::HALF);
+    let angle_deg = request.angle_deg.unwrap_or(factory.angle_deg);
+    let resolution_cdeg = request.resolution_cdeg.unwrap_or(factory.resolution_cdeg);
+    if family == Some(Type::Fast) {
+        // A scan with 181 values looks like one of 180 degrees with a resolution of 1 degree.
+        let what = "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
+        let remedy = "a hub can stream lms200, lms211, lms221 and lms291";
+        return Err(Refusal::new(&[Key::Type], what.to_owned(), remedy));
+    }
+    let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
+        let step = f64::from(resolution_cdeg) / 100.0;
+        let what = format!("no sensor scans {angle_deg} degrees at {step}");
+        let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
+        Refusal::new(&[Key::Resolution, Key::Angle, Key::Type], what, remedy)
+    })?;
+    if let Some((family, why)) = family.and_then(|family| Some((family, family.refuses_variant(variant)?))) {
+        let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
+        return Err(Refusal::new(&[Key::Angle, Key::Type], what, "angle = 100"));
+    }
+    Ok(settings::Settings { view: Some((angle_deg, resolution_cdeg)), ..request.checked() })
+}
+
+/// Modes whose values are ranges (Telegram listing, 77h block D).
+const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
+
+/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is
+/// set.
+pub(crate) fn scan_heads(settings: &settings::Settings) -> Vec<ScanHead> {
+    let variant = Settings::from(*settings).variant;
+    let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);
+    let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
+    let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
+    let head = |mm: u8| ScanHead::lms(beams, first, step_mdeg, mm.into(), MAX_RANGE_BITS);
+    units.into_iter().map(head).collect()
+}
+
+/// Range bits of the mode with the most of them (Telegram listing, 77h block D).
+const MAX_RANGE_BITS: u8 = 15;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lms::command::Request;
+
+    #[test]
+    fn requests_are_those_for_type_and_status() {
+        let asks = APPROACH.asks.unwrap();
+        assert_eq!(asks.requests[0], Request::Type.encode(0).bytes());
+        assert_eq!(asks.requests[1], Request::Status.encode(0).bytes());
+        assert!(asks.rates.iter().all(|&rate| Baud::of_rate(rate).is_some()));
+    }
+}

@@ -1,22 +1,339 @@
-//! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1: requests and responses, the framer, packets, revolutions, and the
-//! session with a scanner. No request changes a setting that the scanner keeps without power.
+//! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1. No request changes a setting that the scanner keeps without power.
+//!
+//! Here is what the family declares: its models and modes, its settings, and its recognizer.
 
-mod device_info;
 mod framer;
 mod handshake;
-mod model;
 pub mod packet;
-mod probe;
-mod rate_search;
 mod request;
 mod sequence;
 mod session;
 mod stream;
-mod stream_head;
+
+use scanhub_schema::{Family, MILLIS};
+
+use crate::line::family::{Approach, Asks, Evidence, Stop};
+use crate::rplidar::framer::{Expect, Found, Framer};
+use crate::rplidar::packet::Kind;
+use crate::rplidar::request::{Answer, Head};
+use crate::settings::Settings;
 
 pub use crate::line::{Tally, TurnCounts};
-pub use device_info::{Health, Info};
-pub use model::{Mode, Model};
-pub use probe::Probe;
+pub use request::{Health, Info};
 pub use session::{FEATURES, Session, Trouble};
 pub(crate) use session::{check, scan_heads};
+
+/// A scanner of the family.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Model {
+    /// A1M8.
+    A1,
+    /// A2M8, and the older ones of its kind.
+    A2m8,
+    /// A2M12.
+    A2m12,
+    /// A3M1.
+    A3,
+    /// S1.
+    S1,
+    /// S2.
+    S2,
+    /// S3.
+    S3,
+    /// C1.
+    C1,
+}
+
+/// What turns the head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Motor {
+    /// The line DTR, while it is not asserted; nothing else can.
+    Dtr,
+    /// A request with a duty cycle, if an accessory board is there to obey; else as [`Motor::Dtr`].
+    Board,
+    /// A request with a speed.
+    Speed,
+}
+
+impl Model {
+    /// All of them.
+    pub const ALL: [Model; 8] =
+        [Model::A1, Model::A2m8, Model::A2m12, Model::A3, Model::S1, Model::S2, Model::S3, Model::C1];
+
+    /// Its name in configuration and words.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Model::A1 => "a1",
+            Model::A2m8 => "a2m8",
+            Model::A2m12 => "a2m12",
+            Model::A3 => "a3",
+            Model::S1 => "s1",
+            Model::S2 => "s2",
+            Model::S3 => "s3",
+            Model::C1 => "c1",
+        }
+    }
+
+    /// The model of this name.
+    pub fn named(name: &str) -> Option<Model> {
+        Model::ALL.into_iter().find(|model| model.name() == name)
+    }
+
+    /// Returns the model of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Model> {
+        settings.model.and_then(Model::named)
+    }
+
+    /// The model that says `id` of itself: its series in the upper half.
+    pub(crate) fn of_id(id: u8) -> Option<Model> {
+        match (id >> 4, id & 15) {
+            (1, _) => Some(Model::A1),
+            (2, 12) => Some(Model::A2m12),
+            (2, _) => Some(Model::A2m8),
+            (3, _) => Some(Model::A3),
+            (4, _) => Some(Model::C1),
+            (6, _) => Some(Model::S1),
+            (7, _) => Some(Model::S2),
+            (8, _) => Some(Model::S3),
+            _ => None,
+        }
+    }
+
+    /// Returns the number that the usual hardware of this model reports, for [`Model::of_id`].
+    pub(crate) fn id(self) -> u8 {
+        match self {
+            Model::A1 => 0x18,
+            Model::A2m8 => 0x28,
+            Model::A2m12 => 0x2C,
+            Model::A3 => 0x31,
+            Model::C1 => 0x41,
+            Model::S1 => 0x61,
+            Model::S2 => 0x71,
+            Model::S3 => 0x81,
+        }
+    }
+
+    /// The rate at which it speaks, in bits per second.
+    pub const fn baud(self) -> u32 {
+        match self {
+            Model::A1 | Model::A2m8 => 115_200,
+            Model::A2m12 | Model::A3 | Model::S1 => 256_000,
+            Model::C1 => 460_800,
+            Model::S2 | Model::S3 => 1_000_000,
+        }
+    }
+
+    /// Points that it measures in a second in its fastest mode.
+    pub const fn points_per_second(self) -> u32 {
+        match self {
+            Model::A1 => 7_874,
+            Model::A2m8 => 8_000,
+            Model::A2m12 | Model::A3 => 16_000,
+            Model::S1 => 9_200,
+            Model::S2 | Model::S3 => 32_000,
+            Model::C1 => 5_000,
+        }
+    }
+
+    /// Turns in a second.
+    pub const fn turns_per_second(self) -> f32 {
+        match self {
+            Model::A1 => 7.3,
+            _ => 10.0,
+        }
+    }
+
+    /// Beams of a turn in its fastest mode unless something else is asked for: its points.
+    pub const fn beams(self) -> usize {
+        self.beams_of(self.points_per_second() as f32)
+    }
+
+    /// Beams of a turn where so many points are measured in a second.
+    const fn beams_of(self, points_per_second: f32) -> usize {
+        (points_per_second / self.turns_per_second() + 0.5) as usize
+    }
+
+    /// Returns the number of beams for a mode in which the scanner measures `points_per_second`: that of the model's fastest
+    /// mode, if it is close.
+    pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
+        let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
+        let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= CLOSE;
+        if is_close { fastest } else { beams }
+    }
+}
+
+/// Share by which a number of beams may differ from that of the model's fastest mode, and still counts as the same.
+const CLOSE: f64 = 0.03;
+
+/// A way of measuring that a model may offer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// A packet for each point, with its quality; the slowest.
+    Standard,
+    /// More points in packets with a checksum.
+    Express,
+    /// More points, for short distances.
+    Boost,
+    /// More points, for dark targets.
+    Sensitivity,
+    /// Fewer points, where the sun shines.
+    Stability,
+    /// The fastest of the S series and of the C1.
+    DenseBoost,
+    /// The fastest with a quality for each point.
+    UltraDense,
+}
+
+impl Mode {
+    /// All of them.
+    pub const ALL: [Mode; 7] = [
+        Mode::Standard,
+        Mode::Express,
+        Mode::Boost,
+        Mode::Sensitivity,
+        Mode::Stability,
+        Mode::DenseBoost,
+        Mode::UltraDense,
+    ];
+
+    /// Its name in configuration and words.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Mode::Standard => "standard",
+            Mode::Express => "express",
+            Mode::Boost => "boost",
+            Mode::Sensitivity => "sensitivity",
+            Mode::Stability => "stability",
+            Mode::DenseBoost => "denseboost",
+            Mode::UltraDense => "ultradense",
+        }
+    }
+
+    /// The mode of this name.
+    pub fn named(name: &str) -> Option<Mode> {
+        Mode::said(name.as_bytes())
+    }
+
+    /// Returns the mode of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Mode> {
+        settings.mode.and_then(Mode::named)
+    }
+
+    /// The mode that a scanner calls `name`: in capitals, with spaces, ended by a zero, as it likes.
+    pub(crate) fn said(name: &[u8]) -> Option<Mode> {
+        Mode::ALL.into_iter().find(|mode| {
+            let letters = name.iter().filter(|byte| byte.is_ascii_alphanumeric());
+            letters.map(u8::to_ascii_lowercase).eq(mode.name().bytes())
+        })
+    }
+}
+
+/// Recognizer of RPLIDAR replies.
+#[derive(Clone, Debug)]
+pub struct Probe {
+    framer: Framer,
+    is_asked: bool,
+    /// Whether packets have arrived.
+    is_stream: bool,
+    /// The identity that the scanner has reported.
+    info: Option<Info>,
+}
+
+impl Default for Probe {
+    fn default() -> Self {
+        Probe { framer: Framer::new(Expect::Anything(None)), is_asked: false, is_stream: false, info: None }
+    }
+}
+
+impl crate::line::family::Probe for Probe {
+    fn approach(&self) -> &'static Approach {
+        &APPROACH
+    }
+
+    fn clear(&mut self) {
+        *self = Probe::default();
+    }
+
+    // A fragment of an earlier reply would take the descriptor of the next one along, so nothing of it is kept.
+    fn expect_reply(&mut self, is_expected: bool) {
+        let expect = if is_expected { Expect::Answers } else { Expect::Anything(None) };
+        *self = Probe { framer: Framer::new(expect), is_asked: is_expected, ..Probe::default() };
+    }
+
+    fn receive(&mut self, mut bytes: &[u8]) {
+        while !bytes.is_empty() {
+            let spare = self.framer.spare();
+            let len = spare.len().min(bytes.len());
+            spare[..len].copy_from_slice(&bytes[..len]);
+            self.framer.commit(len);
+            bytes = &bytes[len..];
+            while let Some(found) = self.framer.advance(1) {
+                match found {
+                    Found::Reply(Answer::Info, span) => {
+                        self.info = Info::parse(&self.framer.bytes(span)[Head::LEN..]);
+                    }
+                    Found::Packets(..) | Found::Stream(_) => self.is_stream = true,
+                    Found::Reply(..) | Found::Greeting { .. } => {}
+                }
+            }
+            self.is_stream |= self.framer.is_alike();
+        }
+    }
+
+    fn evidence(&self) -> Evidence {
+        match self.info {
+            Some(info) => Evidence::Found(info.model().map(|model| model.name())),
+            None if self.is_stream => Evidence::Stream,
+            None if self.is_asked && self.framer.buffered() > 0 => Evidence::Begun,
+            None => Evidence::None,
+        }
+    }
+}
+
+const APPROACH: Approach = Approach {
+    family: Family::Rplidar,
+    listens: &[],
+    asks: Some(Asks {
+        rates: &[115_200, 256_000, 460_800, 1_000_000],
+        settle: 0,
+        stop: Some(Stop { request: &[0xA5, 0x25], quiet: 15 * MILLIS, at_most: 60 * MILLIS }),
+        requests: &[&[0xA5, 0x50]],
+        gap: None,
+        // A reply takes some milliseconds, and an adapter that collects bytes adds 16, twice.
+        reply: 70 * MILLIS,
+        patience: 0,
+        extension: 20 * MILLIS,
+        repeats: 2,
+    }),
+    boot_rate: None,
+    max_transmission: Kind::LONGEST,
+    advice: "it needs 5 V for the scanner and its motor",
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rplidar::request::Request;
+
+    #[test]
+    fn id_belongs_to_the_model() {
+        assert!(Model::ALL.into_iter().all(|model| Model::of_id(model.id()) == Some(model)));
+        assert_eq!([0x00, 0x58, 0x77, 0x91].map(Model::of_id), [None, None, Some(Model::S2), None]);
+    }
+
+    #[test]
+    fn a_mode_has_the_beams_of_the_fastest_one_if_they_are_close() {
+        // The scanner reports 127 us per point, and its data sheet 8,000 points per second.
+        assert_eq!(Model::A2m8.beams_in_mode(1e6 / 127.0), 800);
+        assert_eq!(Model::A2m12.beams_in_mode(1e6 / 63.0), 1_600);
+        assert_eq!(Model::A2m8.beams_in_mode(1e6 / 201.0), 498);
+        assert_eq!(Model::A1.beams_in_mode(1e6 / 254.0), 539);
+    }
+
+    #[test]
+    fn requests_are_those_to_stop_and_for_the_identity() {
+        let asks = APPROACH.asks.unwrap();
+        assert_eq!(asks.stop.unwrap().request, Request::STOP.bytes());
+        assert_eq!(asks.requests, [Request::INFO.bytes()]);
+    }
+}

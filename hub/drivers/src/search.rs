@@ -21,7 +21,7 @@ use core::fmt;
 use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::families::probes;
-use crate::line::probe::{Approach, Asks, Evidence, Probe};
+use crate::line::family::{Approach, Asks, Evidence, Probe};
 use crate::line::{Account, Output, Protocol};
 
 /// Result of a search.

@@ -6,8 +6,8 @@ use std::fmt;
 use scanhub_schema::Family;
 
 use crate::families::{check, features};
+use crate::line;
 use crate::line::family::Features;
-use crate::line::grid;
 use crate::lms;
 
 /// Declares the keys, each with its name in a configuration, and the field that a request has for its value.
@@ -161,8 +161,8 @@ impl SettingsRequest {
                 (self.mode, self.mode_number) = ((!is_auto).then(|| mode.to_owned()), None);
             }
             (Key::Beams, Value::Whole(number)) => {
-                let beams = usize::try_from(number).ok().filter(|beams| grid::BEAMS.contains(beams));
-                let (least, most) = (grid::BEAMS.start(), grid::BEAMS.end());
+                let beams = usize::try_from(number).ok().filter(|beams| line::BEAMS.contains(beams));
+                let (least, most) = (line::BEAMS.start(), line::BEAMS.end());
                 let remedy = || format!("a whole number from {least} to {most}");
                 self.beams = Some(beams.ok_or_else(|| refused(Key::Beams, value, remedy()))?);
             }

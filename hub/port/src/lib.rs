@@ -7,8 +7,6 @@ pub mod clock;
 mod port_error;
 mod tcp;
 mod tty;
-mod uart;
-mod usb_adapter;
 
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs as _};
@@ -21,13 +19,12 @@ use scanhub_schema::Failure;
 
 pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
 pub use candidates::{
-    Candidate, PROMPT_MS, candidates, check_tty, found_in, is_same_line, is_tty, latency_ms,
+    Candidate, PROMPT_MS, PortlessAdapter, Reason, candidates, check_tty, found_in, is_same_line, is_tty,
+    latency_ms,
 };
 pub use port_error::PortError;
 pub use tcp::{Allowance, Dial, Tcp};
-pub use tty::{Alteration, Tty};
-pub use uart::{Counts, LineErrors};
-pub use usb_adapter::{PortlessAdapter, Reason};
+pub use tty::{Alteration, Counts, LineErrors, Tty};
 
 /// Source of a link's bytes, as it is written in a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]

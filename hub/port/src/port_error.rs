@@ -9,8 +9,7 @@ use rustix::io::Errno;
 use scanhub_schema::{Failure, Kind};
 
 use super::access::{Holder, Rights, holder, is_own, lock_owner};
-use super::candidates::{Candidate, candidates};
-use super::usb_adapter::PortlessAdapter;
+use super::candidates::{Candidate, PortlessAdapter, candidates};
 use crate::Source;
 
 /// Only the reason; equal as long as nothing changes.
@@ -223,7 +222,7 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::usb_adapter::Reason;
+    use crate::candidates::Reason;
 
     #[test]
     fn what_the_kernel_says_and_what_it_means() {

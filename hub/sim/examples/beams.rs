@@ -2,8 +2,8 @@
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
 //! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
 
-use scanhub_drivers::line::grid::{Grid, Point};
 use scanhub_drivers::line::{Event, Output, Session};
+use scanhub_drivers::line::{Grid, NOT_MEASURED, Point};
 use scanhub_drivers::{Settings, ld, rplidar};
 use scanhub_schema::{MILLIS, Nanos, line_time};
 use scanhub_sim::Arrival;
@@ -79,8 +79,9 @@ impl Sheet {
 
     /// How many of `points` collapsed, and how many beams were not measured.
     fn fill(&mut self, points: &[Point]) -> (u32, u32) {
-        let placed = self.grid.fill(points, &mut self.ranges, &mut self.intensities, &mut self.angles);
-        (placed.collapsed, placed.not_measured)
+        let collisions = self.grid.fill(points, &mut self.ranges, &mut self.intensities, &mut self.angles);
+        let empty = self.ranges.iter().filter(|range| **range == NOT_MEASURED).count();
+        (collisions, empty as u32)
     }
 }
 

@@ -1,8 +1,12 @@
-//! The one kind of packet that the scanners send: 47 bytes with 12 points, in both directions. Source: the manuals of LD06
-//! and LD19, "data packet format".
+//! The one kind of packet that the scanners send: 47 bytes with 12 points, in both directions (source: the manuals of LD06
+//! and LD19, "data packet format"), and the framer that finds packets in a stream of bytes of which some are missing. The
+//! framer never discards an intact packet.
 
-use crate::line;
-use crate::line::grid::Point;
+use scanhub_schema::{MILLIS, Nanos};
+
+use crate::line::Point;
+use crate::line::framing::{Verdict, judge};
+use crate::line::{self, Buffer, Tally, suspect};
 
 /// Bytes of a packet.
 pub const LEN: usize = 47;
@@ -90,7 +94,7 @@ impl<'a> Packet<'a> {
     pub fn point(&self, i: usize) -> Point {
         let (range, intensity) = self.measured(i);
         // The highest values are codes.
-        let range = if (1..=LONGEST).contains(&range) { range } else { line::grid::NO_RETURN };
+        let range = if (1..=LONGEST).contains(&range) { range } else { line::NO_RETURN };
         Point { angle: self.angle(i) * -RADIANS, range, intensity }
     }
 
@@ -156,6 +160,136 @@ const FIRST_POINT: usize = 6;
 const END: usize = FIRST_POINT + 3 * POINTS;
 /// Radians in a hundredth of a degree.
 const RADIANS: f32 = core::f32::consts::PI / 18_000.0;
+
+/// Packets without anything between them, in the framer's buffer until the next bytes come.
+#[derive(Clone, Copy, Debug)]
+pub struct Span {
+    at: usize,
+    /// How many.
+    pub packets: usize,
+    /// Number of the first byte among all bytes committed, from 0.
+    pub offset: u64,
+    /// Bits of [`suspect`]; 0 is clean.
+    pub reasons: u8,
+}
+
+/// The framer with its buffer.
+#[derive(Clone, Debug, Default)]
+pub struct Framer {
+    buffer: Buffer<CAPACITY>,
+    /// A packet waits for a header inside it.
+    is_held: bool,
+    /// It shall not any more.
+    is_released: bool,
+    /// Bytes were discarded since the last packet.
+    damage: bool,
+}
+
+struct Format;
+
+impl line::framing::Format for Format {
+    type Reject = Reject;
+
+    fn packet_len(&self) -> usize {
+        LEN
+    }
+
+    fn begins(&self, bytes: &[u8]) -> bool {
+        let len = bytes.len().min(HEADER.len());
+        bytes[..len] == HEADER[..len]
+    }
+
+    fn check(&self, packet: &[u8]) -> Result<(), Reject> {
+        packet.first_chunk().map_or(Err(Reject::Checksum), Packet::check).map(|_| ())
+    }
+}
+
+impl Framer {
+    /// Room for the next bytes, never empty after [`Framer::advance`] answered `None`: write into its beginning, then
+    /// [`Framer::commit`].
+    pub fn spare(&mut self) -> &mut [u8] {
+        self.buffer.spare()
+    }
+
+    /// The first `len` bytes of [`Framer::spare`] are valid now.
+    pub fn commit(&mut self, len: usize) {
+        self.buffer.commit(len);
+        self.is_released &= len == 0;
+    }
+
+    /// The next packets, `most` at most; `None` until more bytes come.
+    pub fn advance(&mut self, most: usize) -> Option<Span> {
+        self.is_held = false;
+        loop {
+            match self.judge(0) {
+                Verdict::Packet => break,
+                Verdict::Open | Verdict::Held => return None,
+                Verdict::Nothing(rejected) => self.discard(rejected),
+            }
+        }
+        let mut packets = 1;
+        while packets < most && matches!(self.judge(packets * LEN), Verdict::Packet) {
+            packets += 1;
+        }
+        let is_damaged = core::mem::take(&mut self.damage) && self.tally().packets > 0;
+        let offset = self.buffer.offset();
+        let at = self.buffer.take(packets * LEN, packets);
+        Some(Span { at, packets, offset, reasons: if is_damaged { suspect::NEIGHBOUR } else { 0 } })
+    }
+
+    /// The bytes at a span that [`Framer::advance`] answered last.
+    pub fn bytes(&self, span: Span) -> &[u8] {
+        self.buffer.taken(span.at, span.packets * LEN)
+    }
+
+    /// How long the line must be idle until [`Framer::release`] may let the packet pass that waits; `None` if none does.
+    pub fn hold(&self) -> Option<Nanos> {
+        self.is_held.then_some(HOLD)
+    }
+
+    /// A read found nothing, and no byte came for `idle`: gives up waiting for headers inside a packet.
+    pub fn release(&mut self, idle: Nanos) {
+        self.is_released |= self.is_held && idle >= HOLD;
+    }
+
+    /// Gives up all bytes that are still open, for example because the line's rate changes.
+    pub fn clear(&mut self) {
+        self.buffer.clear();
+        (self.is_held, self.is_released, self.damage) = (false, false, false);
+    }
+
+    /// What became of the bytes.
+    pub fn tally(&self) -> &Tally {
+        self.buffer.tally()
+    }
+
+    /// Bytes whose fate is open.
+    pub fn buffered(&self) -> usize {
+        self.buffer.open().len()
+    }
+
+    fn judge(&mut self, at: usize) -> Verdict<Reject> {
+        let verdict = judge(&Format, &self.buffer.open()[at..], self.is_released);
+        self.is_held |= verdict == Verdict::Held;
+        verdict
+    }
+
+    /// Gives up the first open byte and all behind it up to the next that a packet may begin with.
+    fn discard(&mut self, rejected: Option<Reject>) {
+        if rejected == Some(Reject::Checksum) {
+            self.buffer.reject_checksum();
+        }
+        let behind = &self.buffer.open()[1..];
+        let skipped = 1 + behind.iter().position(|&byte| byte == HEADER[0]).unwrap_or(behind.len());
+        self.buffer.discard(skipped);
+        self.damage = true;
+    }
+}
+
+/// What a tty keeps for a reader who is late, and a piece of a packet.
+const CAPACITY: usize = 4_096 + 2 * LEN;
+/// A packet takes 2.04 ms at 230,400 baud; after so long without a byte none is under way.
+const HOLD: Nanos = 4 * MILLIS;
 
 #[cfg(test)]
 mod tests {

@@ -3,7 +3,7 @@
 
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::ld::model::Model;
+use crate::ld::Model;
 use crate::ld::packet::{POINTS, Packet};
 use crate::ld::sequence::Place;
 

@@ -6,11 +6,11 @@ use core::fmt;
 
 use scanhub_schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
-use crate::ld::framer::{Framer, Span};
-use crate::ld::model::Model;
+use crate::ld::Model;
+use crate::ld::packet::{Framer, Span};
 use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::point_count::{Counted, PointCount};
-use crate::ld::restarts::Restarts;
+use crate::ld::sequence::Restarts;
 use crate::ld::sequence::{Place, Sequence};
 use crate::line::family::{self, Features, table};
 use crate::line::{

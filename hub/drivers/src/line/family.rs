@@ -1,4 +1,9 @@
-//! What a configuration can name: the models and settings of a family.
+//! What a family declares: the models and settings that a configuration can name, and how the search recognizes one of its
+//! scanners on a line. [`crate::search`] runs the steps of an [`Approach`], and passes the bytes to a [`Probe`].
+
+use core::fmt;
+
+use scanhub_schema::{Family, Nanos};
 
 use crate::settings::Key;
 
@@ -52,3 +57,125 @@ macro_rules! table {
     }};
 }
 pub(crate) use table;
+
+/// Recognizer of a family.
+pub trait Probe: fmt::Debug + Send {
+    /// Returns what the search may do to find this family.
+    fn approach(&self) -> &'static Approach;
+
+    /// Discards all bytes, because the rate has changed. No reply is expected.
+    fn clear(&mut self);
+
+    /// Sets whether a reply to the family's own request is expected.
+    fn expect_reply(&mut self, is_expected: bool) {
+        let _ = is_expected;
+    }
+
+    /// Handles bytes of the line.
+    fn receive(&mut self, bytes: &[u8]);
+
+    /// Returns how long the line must be idle until [`release`](Self::release) may accept bytes that are ambiguous so far. `None`
+    /// if there are none.
+    fn hold(&self) -> Option<Nanos> {
+        None
+    }
+
+    /// A read found nothing, and no byte has arrived for `idle`.
+    fn release(&mut self, idle: Nanos) {
+        let _ = idle;
+    }
+
+    /// Returns what the bytes since the last [`clear`](Self::clear) prove.
+    fn evidence(&self) -> Evidence;
+}
+
+/// Evidence about the scanner that has sent some bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Evidence {
+    /// Nothing.
+    None,
+    /// A transmission of the family may have been damaged. It is worth sending the request again.
+    Damaged,
+    /// A transmission of the family may have begun. It is worth waiting for its end.
+    Begun,
+    /// The bytes look like a stream of the family. A reply is needed to prove it.
+    Stream,
+    /// The scanner belongs to the family, and to this model if it has reported one.
+    Found(Option<&'static str>),
+}
+
+/// Rates and requests by which the search may find a family.
+#[derive(Clone, Copy, Debug)]
+pub struct Approach {
+    /// The family.
+    pub family: Family,
+    /// Steps without a request, in this order.
+    pub listens: &'static [Listen],
+    /// Steps with a request. `None` for a family that never gets a byte.
+    pub asks: Option<Asks>,
+    /// Rate at which a scanner reports that it has started, in bits per second. The search pauses at this rate.
+    pub boot_rate: Option<u32>,
+    /// Maximum number of bytes of a transmission.
+    pub max_transmission: usize,
+    /// Properties of the scanner that the user should check if it is not found, as part of a message.
+    pub advice: &'static str,
+}
+
+impl Approach {
+    /// Returns the rates at which the search looks for the family, in bits per second, in increasing order.
+    pub fn rates(&self) -> Vec<u32> {
+        let asks = self.asks.map_or(&[][..], |asks| asks.rates);
+        let mut rates: Vec<u32> = self.listens.iter().map(|listen| listen.rate).collect();
+        rates.extend(asks);
+        rates.sort_unstable();
+        rates.dedup();
+        rates
+    }
+}
+
+/// Step that only listens.
+#[derive(Clone, Copy, Debug)]
+pub struct Listen {
+    /// Rate in bits per second.
+    pub rate: u32,
+    /// Duration.
+    pub span: Nanos,
+    /// Whether the step is skipped in a round in which no byte has arrived.
+    pub needs_bytes: bool,
+}
+
+/// Steps that send a request at one rate after the other.
+#[derive(Clone, Copy, Debug)]
+pub struct Asks {
+    /// Rates in bits per second, the likeliest first.
+    pub rates: &'static [u32],
+    /// Time between a change of the rate and the first byte.
+    pub settle: Nanos,
+    /// Request that stops a stream. It is sent first.
+    pub stop: Option<Stop>,
+    /// Requests for a reply. Every round uses the next one.
+    pub requests: &'static [&'static [u8]],
+    /// Minimum and maximum time between the end of a byte and the next one. `None` if the scanner accepts any time: then
+    /// a request is one write.
+    pub gap: Option<(Nanos, Nanos)>,
+    /// Time for the reply to begin, from the last byte of the request.
+    pub reply: Nanos,
+    /// Additional time for the reply in every second round, for slow scanners.
+    pub patience: Nanos,
+    /// Additional time for a reply that has [begun](Evidence::Begun).
+    pub extension: Nanos,
+    /// Number of times that the request is sent in every second round. A request whose reply may have been
+    /// [damaged](Evidence::Damaged) is sent again in any round.
+    pub repeats: u8,
+}
+
+/// Request that stops a stream, and the wait for the end of the stream.
+#[derive(Clone, Copy, Debug)]
+pub struct Stop {
+    /// The request.
+    pub request: &'static [u8],
+    /// The stream has ended when no byte has arrived for this time.
+    pub quiet: Nanos,
+    /// After this time, the search sends its request even if bytes still arrive.
+    pub at_most: Nanos,
+}

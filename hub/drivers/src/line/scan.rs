@@ -1,11 +1,12 @@
-//! A scan in the buffer of a session, complete or still arriving. It writes itself into a payload: here raw values
-//! become ranges, directly in the shared memory that subscribers read.
+//! A scan in the buffer of a session, complete or still arriving, and the grid of beams that the points of a revolution are
+//! assigned to. A scan writes itself into a payload: here raw values become ranges, directly in the shared memory that
+//! subscribers read.
 
-use std::f64::consts::TAU;
+use core::f32::consts::TAU;
 
-use crate::line::grid::{Grid, Point};
-use crate::line::{self, Closed};
 use scanhub_schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
+
+use crate::line::Closed;
 
 /// A scan as it was received.
 #[derive(Clone, Copy, Debug)]
@@ -103,8 +104,8 @@ impl<'a> RawScan<'a> {
                 upper[arrived..].fill(0);
             }
             Values::Points { points, .. } => {
-                let placed = Grid::new(self.beams()).fill(points, ranges, upper, angles);
-                scan.collapsed = u16::try_from(placed.collapsed).unwrap_or(u16::MAX);
+                let collisions = Grid::new(self.beams()).fill(points, ranges, upper, angles);
+                scan.collapsed = u16::try_from(collisions).unwrap_or(u16::MAX);
             }
         }
     }
@@ -122,7 +123,7 @@ pub fn revolution_head(
     let head = ScanHead::turning(family, beams);
     // The scanner's own points in a revolution.
     let own = f64::from(points_per_second) * period as f64 / 1e9;
-    let spacing = if own >= 1.0 { TAU / own } else { -head.step };
+    let spacing = if own >= 1.0 { core::f64::consts::TAU / own } else { -head.step };
     ScanHead {
         spacing: spacing as f32,
         beam_time_ns: u32::try_from(period / beams.max(1) as u64).unwrap_or(u32::MAX),
@@ -131,14 +132,100 @@ pub fn revolution_head(
     }
 }
 
-const _: () = assert!(line::grid::NO_RETURN == Code::NoReturn.value());
-const _: () = assert!(line::grid::NOT_MEASURED == Scan::NOT_MEASURED);
-const _: () = assert!(*line::grid::BEAMS.end() == scanhub_schema::BEAMS);
+/// One measurement of a rotating scanner.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Point {
+    /// Radians, 0 ahead, counter-clockwise positive as seen from above: a head that rotates clockwise goes from 0 to -2 pi.
+    pub angle: f32,
+    /// Millimeters, or [`NO_RETURN`].
+    pub range: u16,
+    /// Strength of the echo, in the scanner's own counts.
+    pub intensity: u8,
+}
+
+/// Range of a beam without an echo: farther than any range.
+pub const NO_RETURN: u16 = Code::NoReturn.value();
+/// Range of a beam without a point in this revolution.
+pub const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
+/// Numbers of beams that a revolution may have.
+pub const BEAMS: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::BEAMS;
+
+/// Equal bins all around for a head that rotates clockwise. Beam 0 is ahead, and beam `i` at `-i` times the step, so beams
+/// are in the order of measuring. The bin of beam 0 begins half a step before the scanner's zero: 0 and 360 degrees are
+/// one beam.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grid {
+    beams: usize,
+}
+
+impl Grid {
+    /// Creates a grid of `beams` beams, limited to [`BEAMS`].
+    pub const fn new(beams: usize) -> Grid {
+        let (least, most) = (*BEAMS.start(), *BEAMS.end());
+        let beams = if beams < least { least } else { beams };
+        Grid { beams: if beams > most { most } else { beams } }
+    }
+
+    /// Returns the number of beams.
+    pub const fn beams(&self) -> usize {
+        self.beams
+    }
+
+    /// Returns the radians from one beam to the next, which are negative.
+    pub fn step(&self) -> f64 {
+        -core::f64::consts::TAU / self.beams as f64
+    }
+
+    /// Assigns `points`, in any order, to beams by their angles. Each slice has an element for every beam, and all of them are
+    /// written. Among the points of one bin, the nearest one that has a range is kept, with its exact angle. Without a point,
+    /// the angle is not a number. Returns the number of points that were dropped because their beam was taken.
+    pub fn fill(
+        &self,
+        points: &[Point],
+        ranges: &mut [u16],
+        intensities: &mut [u8],
+        angles: &mut [f32],
+    ) -> u32 {
+        let beams = self.beams;
+        let (ranges, intensities, angles) =
+            (&mut ranges[..beams], &mut intensities[..beams], &mut angles[..beams]);
+        ranges.fill(NOT_MEASURED);
+        intensities.fill(0);
+        angles.fill(f32::NAN);
+        let bins_per_radian = -(beams as f32) / TAU;
+        let mut collisions = 0;
+        for point in points {
+            // Up to one more revolution on either side is accepted. The result is rounded to the nearest beam.
+            let place = point.angle * bins_per_radian + (beams as f32 + 0.5);
+            // An angle that is not a number has no beam.
+            let mut bin = if place >= 0.0 { place as usize } else { usize::MAX };
+            let mut angle = point.angle - TAU;
+            for _ in 0..2 {
+                if bin >= beams {
+                    (bin, angle) = (bin - beams, angle + TAU);
+                }
+            }
+            let Some(range) = ranges.get_mut(bin) else { continue };
+            let is_taken = *range != NOT_MEASURED;
+            collisions += u32::from(is_taken);
+            // A point without an echo is farther than any range.
+            if point.range < *range {
+                *range = point.range;
+                intensities[bin] = point.intensity;
+                // The angle is within the same revolution as that of its beam.
+                angles[bin] =
+                    if (beams..2 * beams).contains(&(place as usize)) { point.angle } else { angle };
+            }
+        }
+        collisions
+    }
+}
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use scanhub_schema::Contents;
+
+    use super::*;
 
     #[test]
     fn writes_revolution() {
@@ -188,5 +275,86 @@ mod tests {
         raw(&bytes[..3]).write(&mut scan);
         let rest = Scan::NOT_MEASURED;
         assert_eq!((scan.ranges(), scan.upper()), (&[10, rest, rest][..], &[1, 0, 0][..]));
+    }
+
+    const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
+
+    fn at(degrees: f32, range: u16) -> Point {
+        Point { angle: -degrees.to_radians(), range, intensity: (range % 251) as u8 }
+    }
+
+    /// Ranges and the exact angles in degrees, clockwise, of `points` on 8 beams.
+    fn eight(points: &[Point]) -> ([u16; 8], [f32; 8], u32) {
+        let (mut ranges, mut intensities, mut angles) = ([7; 8], [7; 8], [7.0; 8]);
+        let collisions = Grid::new(8).fill(points, &mut ranges, &mut intensities, &mut angles);
+        for (range, intensity) in ranges.iter().zip(intensities) {
+            let expected = if *range == NOT_MEASURED { 0 } else { (*range % 251) as u8 };
+            assert_eq!(intensity, expected);
+        }
+        (ranges, angles.map(|angle| -angle.to_degrees()), collisions)
+    }
+
+    #[test]
+    fn the_nearest_that_has_a_range_wins_and_keeps_its_angle() {
+        let turn = [at(44.0, 900), at(47.0, 300), at(50.0, NO_RETURN), at(89.0, NO_RETURN), at(91.0, 1200)];
+        let (ranges, angles, collisions) = eight(&turn);
+        assert_eq!(ranges[..3], [NOT_MEASURED, 300, 1200]);
+        assert!((angles[1] - 47.0).abs() < 1e-3 && (angles[2] - 91.0).abs() < 1e-3 && angles[0].is_nan());
+        let empty = ranges.iter().filter(|range| **range == NOT_MEASURED).count();
+        assert_eq!((collisions, empty), (3, 6));
+    }
+
+    #[test]
+    fn nothing_came_back_is_another_thing_than_nothing_was_measured() {
+        let (ranges, angles, collisions) = eight(&[at(90.0, NO_RETURN), at(92.0, NO_RETURN)]);
+        assert_eq!((ranges[2], ranges[3]), (NO_RETURN, NOT_MEASURED));
+        assert!((angles[2] - 90.0).abs() < 1e-3);
+        let empty = ranges.iter().filter(|range| **range == NOT_MEASURED).count();
+        assert_eq!((collisions, empty), (1, 7));
+    }
+
+    #[test]
+    fn zero_and_a_turn_are_one_beam_from_both_sides() {
+        for degrees in [-22.0, 0.0, 22.0, 338.0, 360.0, 382.0] {
+            let (ranges, ..) = eight(&[at(degrees, 500)]);
+            assert_eq!(ranges[0], 500, "{degrees}");
+        }
+        assert_eq!(eight(&[at(23.0, 5)]).0[1], 5);
+        assert_eq!(eight(&[at(337.0, 5)]).0[7], 5);
+        assert_eq!(eight(&[at(-23.0, 5)]).0[7], 5);
+    }
+
+    #[test]
+    fn the_order_of_points_changes_nothing() {
+        let mut random = fastrand::Rng::with_seed(3);
+        let mut turn = [NONE; 1_000];
+        for (number, point) in turn.iter_mut().enumerate() {
+            *point = at(number as f32 * 0.36 + random.f32(), random.u16(..4_000));
+        }
+        let fill = |points: &[Point]| {
+            let (mut ranges, mut intensities, mut angles) = ([0; 450], [0; 450], [0.0; 450]);
+            let collisions = Grid::new(450).fill(points, &mut ranges, &mut intensities, &mut angles);
+            (ranges, collisions)
+        };
+        let ordered = fill(&turn);
+        random.shuffle(&mut turn);
+        assert_eq!(fill(&turn), ordered);
+    }
+
+    #[test]
+    fn every_angle_has_a_place_even_one_that_is_none() {
+        let grid = Grid::new(8_192);
+        let (mut ranges, mut intensities, mut angles) = ([0; 8_192], [0; 8_192], [0.0; 8_192]);
+        let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 100.0, -100.0, TAU, -TAU, 2.0 * TAU];
+        let points = wild.map(|angle| Point { angle, ..NONE });
+        let collisions = grid.fill(&points, &mut ranges, &mut intensities, &mut angles);
+        assert_eq!((ranges[0], collisions), (NO_RETURN, 1));
+        assert!(ranges[1..].iter().all(|range| *range == NOT_MEASURED));
+        for beam in 0..8_192 {
+            let point = Point { angle: (beam as f64 * grid.step()) as f32, range: 77, intensity: 1 };
+            grid.fill(&[point], &mut ranges, &mut intensities, &mut angles);
+            assert_eq!(ranges[beam], 77, "{beam}");
+        }
+        assert_eq!((Grid::new(0).beams(), Grid::new(9_000).beams()), (2, 8_192));
     }
 }

@@ -5,7 +5,7 @@
 //! revolution is complete only when the head is past its end by more than a point can be late, and until then there are
 //! two. Times are those of the scanner's clock.
 
-use crate::line::grid::{NO_RETURN, Point};
+use crate::line::{NO_RETURN, Point};
 use scanhub_schema::Nanos;
 
 /// The revolution that is being measured, and the next one, with at most `N` points each.

@@ -1,23 +1,22 @@
 //! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
 
-use scanhub_schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
+use scanhub_schema::{Counter, Counters, Nanos, Status};
 
 use crate::line::{
-    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, family, suspect,
+    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, suspect,
 };
 use crate::lms::arrival::{Arrivals, Rhythm, Stamp};
 use crate::lms::cadence::{Cadence, Damage};
 use crate::lms::dialogue::Dialogue;
 use crate::lms::exchange::{Outgoing, SOON};
-use crate::lms::family::Family;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::lms::header::Reject;
 use crate::lms::measured::{FirstValues, MEASURED, nominal_period};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::{Sensor, Trouble};
-use crate::lms::telegram::{MAX_TELEGRAM, Telegram};
-use crate::lms::variant::{BYTES_PER_TURN, Baud, MAX_BEAMS, Mode, Unit, Variant};
-use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
+use crate::lms::telegram::Telegram;
+use crate::lms::variant::{BYTES_PER_TURN, Baud, Mode, Unit, Variant};
+use crate::settings;
 
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -508,109 +507,6 @@ fn received<'a>(
     }
 }
 
-/// Models and settings of the family.
-pub const FEATURES: family::Features = family::Features {
-    models: &[],
-    auto: family::Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
-    modes: &[],
-    keys: &[Key::Type, Key::Angle, Key::Resolution, Key::Unit, Key::ModeNumber, Key::Baud],
-    can_rest: false,
-    speaks_unasked: false,
-    has_whole_telegrams: true,
-    has_inquiry: true,
-    contents: Contents::UPPER,
-    max_telegram: MAX_TELEGRAM,
-};
-
-/// Sets a `key` that only an LMS has.
-pub(crate) fn set(request: &mut SettingsRequest, key: Key, value: Value<'_>) -> Result<(), Refusal> {
-    match (key, value) {
-        (Key::Type, Value::Text(name)) => {
-            let family = Family::of_name(name)
-                .ok_or_else(|| refused(Key::Type, value, "lms200, lms211, lms221 or lms291"))?;
-            request.expected_type = Some(family.name());
-        }
-        (Key::Angle, Value::Number(angle)) => {
-            let known = Variant::ALL.map(|variant| variant.angle_deg);
-            let known = known.into_iter().find(|&deg| f64::from(deg) == angle);
-            request.angle_deg = Some(known.ok_or_else(|| refused(Key::Angle, value, "100 or 180"))?);
-        }
-        (Key::Resolution, Value::Number(step)) => {
-            let known = Variant::ALL.map(|variant| variant.resolution_cdeg);
-            let known = known.into_iter().find(|&cdeg| f64::from(cdeg) == step * 100.0);
-            request.resolution_cdeg =
-                Some(known.ok_or_else(|| refused(Key::Resolution, value, "0.25, 0.5 or 1"))?);
-        }
-        (Key::Unit, Value::Text("mm")) => request.unit_mm = Some(Unit::Mm.mm()),
-        (Key::Unit, Value::Text("cm")) => request.unit_mm = Some(Unit::Cm.mm()),
-        (Key::Unit, _) => return Err(refused(Key::Unit, value, "\"mm\" or \"cm\"")),
-        (Key::Baud, Value::Whole(rate)) => {
-            const REMEDY: &str =
-                "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's";
-            let known = u32::try_from(rate).ok().and_then(Baud::of_rate);
-            request.baud = Some(known.ok_or_else(|| refused(Key::Baud, value, REMEDY))?.rate());
-        }
-        (Key::ModeNumber, _) => {
-            let number = if let Value::Whole(number) = value { u8::try_from(number).ok() } else { None };
-            let known = number.filter(|&number| Mode(number).has_ranges());
-            request.mode_number = Some(known.ok_or_else(|| refused(Key::ModeNumber, value, MODES))?);
-            request.mode = None;
-        }
-        _ => return Err(refused(key, value, "a value of another kind")),
-    }
-    Ok(())
-}
-
-/// Returns the settings of an LMS.
-pub(crate) fn check(request: &SettingsRequest) -> Result<settings::Settings, Refusal> {
-    if let Some(model) = &request.model {
-        let what = format!("model = \"{model}\", but a scanner of family lms reports its model");
-        return Err(Refusal::new(&[Key::Model], what, "leave it out; `type` is the expected model"));
-    }
-    if let Some(beams) = request.beams {
-        let what = format!("beams = {beams}, and an lms has its own");
-        return Err(Refusal::new(&[Key::Beams], what, "leave it out; `angle` and `resolution` say how many"));
-    }
-    if let Some(mode) = &request.mode {
-        return Err(Refusal::new(&[Key::ModeName], format!("mode = \"{mode}\""), MODES));
-    }
-    let family = request.expected_type.and_then(Family::of_name);
-    let factory = family.and_then(Family::factory_variant).unwrap_or(Variant::HALF);
-    let angle_deg = request.angle_deg.unwrap_or(factory.angle_deg);
-    let resolution_cdeg = request.resolution_cdeg.unwrap_or(factory.resolution_cdeg);
-    if family == Some(Family::Fast) {
-        // A scan with 181 values looks like one of 180 degrees with a resolution of 1 degree.
-        let what = "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
-        let remedy = "a hub can stream lms200, lms211, lms221 and lms291";
-        return Err(Refusal::new(&[Key::Type], what.to_owned(), remedy));
-    }
-    let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
-        let step = f64::from(resolution_cdeg) / 100.0;
-        let what = format!("no sensor scans {angle_deg} degrees at {step}");
-        let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
-        Refusal::new(&[Key::Resolution, Key::Angle, Key::Type], what, remedy)
-    })?;
-    if let Some((family, why)) = family.and_then(|family| Some((family, family.refuses_variant(variant)?))) {
-        let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
-        return Err(Refusal::new(&[Key::Angle, Key::Type], what, "angle = 100"));
-    }
-    Ok(settings::Settings { view: Some((angle_deg, resolution_cdeg)), ..request.checked() })
-}
-
-/// Modes whose values are ranges (Telegram listing, 77h block D).
-const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
-
-/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is
-/// set.
-pub(crate) fn scan_heads(settings: &settings::Settings) -> Vec<ScanHead> {
-    let variant = Settings::from(*settings).variant;
-    let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);
-    let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
-    let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
-    let head = |mm: u8| ScanHead::lms(beams, first, step_mdeg, mm.into(), MAX_RANGE_BITS);
-    units.into_iter().map(head).collect()
-}
-
 impl From<settings::Settings> for Settings {
     fn from(settings: settings::Settings) -> Settings {
         let settings::Settings { view, baud, mode_number, listen_only, fixed_rate, .. } = settings;
@@ -624,9 +520,6 @@ impl From<settings::Settings> for Settings {
         }
     }
 }
-
-/// Range bits of the mode with the most of them (Telegram listing, 77h block D).
-const MAX_RANGE_BITS: u8 = 15;
 
 /// Counters of rejected telegrams, except for a wrong checksum, which every family has.
 const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [

@@ -1,7 +1,11 @@
-//! Requests to a scanner, and the descriptors of its responses, after the manufacturer's description of the protocol. Requests can be
-//! made only here. None of them changes a setting that the scanner keeps without power.
+//! Requests to a scanner, the descriptors of its responses, and the identity and health that it reports, after the
+//! manufacturer's description of the protocol. Requests can be made only here. None of them changes a setting that the
+//! scanner keeps without power.
+
+use core::fmt;
 
 use crate::rplidar::packet::Kind;
+use crate::rplidar::{Mode, Model, Motor};
 
 /// An encoded request.
 #[derive(Clone, Copy, Debug)]
@@ -192,6 +196,149 @@ const START: u8 = 0xA5;
 /// Maximum length of a response: more than the longest name of a mode needs.
 const LONGEST_REPLY: usize = 64;
 
+/// Identity of a scanner, from its reply to `A5 50`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Info {
+    /// Number of the model. The upper four bits are the series.
+    pub id: u8,
+    /// Version of the firmware: major, minor.
+    pub firmware: (u8, u8),
+    /// Revision of the hardware.
+    pub hardware: u8,
+    /// Serial number.
+    pub serial: [u8; 16],
+}
+
+impl Info {
+    /// Length of a reply, in bytes.
+    pub(crate) const LEN: usize = 20;
+
+    /// Decodes a reply.
+    pub(crate) fn parse(reply: &[u8]) -> Option<Info> {
+        let &[id, minor, major, hardware, ref serial @ ..] = reply.first_chunk::<{ Info::LEN }>()?;
+        Some(Info { id, firmware: (major, minor), hardware, serial: *serial })
+    }
+
+    /// Returns the identity of a scanner whose status has this `text` as its type, such as `S2 denseboost 1.02`. A status has
+    /// no hardware revision and no serial number: they are 0. Returns `None` if neither `model` nor the text has the number
+    /// of the model.
+    pub(crate) fn of_status(model: Option<Model>, text: &str) -> Option<Info> {
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let number = |word: &&str| u8::from_str_radix(word.strip_prefix("0x")?, 16).ok();
+        let version = |word: &&str| {
+            let (major, minor) = word.split_once('.')?;
+            major.parse().ok().zip(minor.parse().ok())
+        };
+        let id = model.map(Model::id).or_else(|| words.first().and_then(number))?;
+        let firmware = words.last().and_then(version).unwrap_or_default();
+        Some(Info { id, firmware, hardware: 0, serial: [0; 16] })
+    }
+
+    /// Encodes the reply.
+    pub(crate) fn encode(&self) -> [u8; Info::LEN] {
+        let mut reply = [0; Info::LEN];
+        let (major, minor) = self.firmware;
+        reply[..4].copy_from_slice(&[self.id, minor, major, self.hardware]);
+        reply[4..].copy_from_slice(&self.serial);
+        reply
+    }
+
+    /// Returns the model, if scanhub knows its number.
+    pub fn model(&self) -> Option<Model> {
+        Model::of_id(self.id)
+    }
+
+    /// Returns how the motor is controlled.
+    pub(crate) fn motor(&self) -> Motor {
+        match self.id >> 4 {
+            0 | 1 => Motor::Dtr,
+            2..=5 => Motor::Board,
+            _ => Motor::Speed,
+        }
+    }
+}
+
+/// Health of a scanner, from its reply to `A5 52`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Health {
+    /// The scanner works.
+    Good,
+    /// The scanner measures, but may fail soon; with its error code.
+    Warning(u16),
+    /// The scanner does not measure; with its error code.
+    Error(u16),
+}
+
+impl Health {
+    /// Decodes a reply.
+    pub(crate) fn parse(reply: &[u8]) -> Option<Health> {
+        let &[status, low, high] = reply.first_chunk()?;
+        let code = u16::from_le_bytes([low, high]);
+        Some(match status {
+            0 => Health::Good,
+            1 => Health::Warning(code),
+            _ => Health::Error(code),
+        })
+    }
+}
+
+impl fmt::Display for Health {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Health::Good => f.write_str("good"),
+            Health::Warning(code) => write!(f, "warning, code {code:04X}h: it measures, and may fail soon"),
+            Health::Error(code) => {
+                write!(
+                    f,
+                    "error, code {code:04X}h: it protects itself and does not measure; is its head blocked?"
+                )
+            }
+        }
+    }
+}
+
+/// Facts that the responses report.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct StreamHead {
+    /// Identity of the scanner, if it is known.
+    pub(crate) info: Option<Info>,
+    /// Mode of the stream, if scanhub knows it.
+    pub(crate) mode: Option<Mode>,
+    /// Microseconds per point, if they are known.
+    pub(crate) sample_us: Option<f64>,
+    /// Kind of the packets.
+    pub(crate) kind: Kind,
+}
+
+impl StreamHead {
+    /// Encodes the responses: the identity, a list of modes that contains only the one of the stream, and the descriptor of the
+    /// packets.
+    pub(crate) fn encode(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        if let Some(info) = &self.info {
+            push(&mut bytes, Answer::Info, &info.encode());
+        }
+        let mut value = |key: u8, value: &[u8]| {
+            push(&mut bytes, Answer::Configuration, &[&[key, 0, 0, 0], value].concat());
+        };
+        value(key::COUNT, &[1, 0]);
+        if let Some(us) = self.sample_us {
+            value(key::SAMPLE_TIME, &((us * 256.0).round() as u32).to_le_bytes());
+        }
+        value(key::ANSWER, &[self.kind.answer()]);
+        if let Some(mode) = self.mode {
+            value(key::NAME, &[mode.name().as_bytes(), &[0]].concat());
+        }
+        bytes.extend(Head::Stream(self.kind).encode());
+        bytes
+    }
+}
+
+fn push(bytes: &mut Vec<u8>, answer: Answer, data: &[u8]) {
+    bytes.extend(Head::Reply(answer, data.len()).encode());
+    bytes.extend(data);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -221,5 +368,16 @@ mod tests {
             assert_eq!(Head::parse(&bytes), None, "{at}");
         }
         assert_eq!(Head::parse(&info[..6]), None);
+    }
+
+    #[test]
+    fn identity_of_a_status() {
+        let info = Info::of_status(Some(Model::S2), "S2 denseboost 1.02").unwrap();
+        assert_eq!((info.id, info.firmware), (0x71, (1, 2)));
+        assert_eq!(Info::parse(&info.encode()), Some(info));
+        let unknown = Info::of_status(None, "0x95 standard 1.30").unwrap();
+        assert_eq!((unknown.id, unknown.firmware), (0x95, (1, 30)));
+        assert_eq!(Info::of_status(Some(Model::A1), "").map(|info| info.firmware), Some((0, 0)));
+        assert_eq!(Info::of_status(None, "A7 standard"), None);
     }
 }

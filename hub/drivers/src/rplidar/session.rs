@@ -13,15 +13,15 @@ use crate::line::{
     self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
     StreamCounters, Tally, TurnCounts, Watchdog,
 };
-use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::framer::{Expect, Found, Framer, Span};
+use crate::rplidar::handshake::RateSearch;
 use crate::rplidar::handshake::{Handshake, Next, Query};
-use crate::rplidar::model::{Mode, Model};
 use crate::rplidar::packet::Kind;
-use crate::rplidar::rate_search::RateSearch;
+use crate::rplidar::request::StreamHead;
 use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
+use crate::rplidar::request::{Health, Info};
 use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
-use crate::rplidar::stream_head::StreamHead;
+use crate::rplidar::{Mode, Model};
 use crate::settings::{Key, Refusal, Settings, SettingsRequest};
 
 /// The session with one scanner.

@@ -7,9 +7,9 @@ use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
 use crate::rplidar::handshake::{Handshake, ScanModes};
-use crate::rplidar::model::{Mode, Model};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::sequence::{Came, Place, Sequence, Step};
+use crate::rplidar::{Mode, Model};
 
 /// The line that packets arrive on.
 #[derive(Clone, Copy, Debug)]
@@ -208,8 +208,8 @@ impl Stream {
             Some(model) => self.beams_of(model, kind, point_ns, handshake),
             None => (points_per_turn + 0.5) as usize,
         };
-        let most = max_beams.unwrap_or(*line::grid::BEAMS.end());
-        let beams = beams.or(self.beams).unwrap_or(own.max(*line::grid::BEAMS.start())).min(most);
+        let most = max_beams.unwrap_or(*line::BEAMS.end());
+        let beams = beams.or(self.beams).unwrap_or(own.max(*line::BEAMS.start())).min(most);
         self.beams = Some(beams);
         self.revolutions.begin(beams);
     }

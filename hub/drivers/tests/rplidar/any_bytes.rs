@@ -98,7 +98,7 @@ fn every_byte_is_counted_once() {
                         assert_eq!(received.bytes.len() % received.count, 0);
                     }
                     Output::Event(Event::Scan(turn)) => {
-                        assert!(turn.first <= turn.last && line::grid::BEAMS.contains(&turn.beams()));
+                        assert!(turn.first <= turn.last && line::BEAMS.contains(&turn.beams()));
                         turns += 1;
                     }
                     Output::SetRate(_) => assert!(!settings.fixed_rate && !settings.listen_only),

@@ -192,7 +192,7 @@ impl Bench {
         let (from, to) = (around - 2.0, around + 10.0 / step + 2.0);
         (from.max(0.0) as u64..to.max(0.0) as u64).any(|point| {
             let sample = Head::sample(point);
-            let range = if range == line::grid::NO_RETURN { 0 } else { u32::from(range) };
+            let range = if range == line::NO_RETURN { 0 } else { u32::from(range) };
             // A difference from no return cannot be told.
             let is_untold = kind == Kind::Ultra && point % 3 == 2 && Head::sample(point + 1).range == 0;
             let sample = if is_untold { Sample { range: 0, ..sample } } else { sample };

@@ -5,7 +5,7 @@ use scanhub_drivers::Settings;
 use scanhub_drivers::ld::Session;
 use scanhub_drivers::ld::packet::LEN;
 use scanhub_drivers::line;
-use scanhub_drivers::line::grid::Point;
+use scanhub_drivers::line::Point;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::beam::NoiseModel;
@@ -195,7 +195,7 @@ impl Bench {
             for (point, number) in turn.points.iter().zip(number..) {
                 let truth = self.head.truth(number);
                 assert!(off(truth.clockwise_deg, clockwise(point)).abs() < angle_deg, "{point:?} {truth:?}");
-                let is_right = match truth.range_mm.filter(|_| point.range < line::grid::NO_RETURN) {
+                let is_right = match truth.range_mm.filter(|_| point.range < line::NO_RETURN) {
                     Some(range) => (range - f64::from(point.range)).abs() < range_mm,
                     None => true,
                 };

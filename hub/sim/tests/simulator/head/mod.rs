@@ -25,11 +25,8 @@ fn every_point_of_every_turn_is_where_the_head_measured_it() {
         let worst = bench.judge_turns(0, 0.05, 2.0);
         assert!(worst < 2 * MILLIS, "{model:?}: {worst}");
         bench.judge_packets();
-        let ranges = bench
-            .turns
-            .iter()
-            .flat_map(|turn| &turn.points)
-            .filter(|point| point.range < line::grid::NO_RETURN);
+        let ranges =
+            bench.turns.iter().flat_map(|turn| &turn.points).filter(|point| point.range < line::NO_RETURN);
         let share =
             ranges.count() as f64 / bench.turns.iter().map(|turn| turn.points.len()).sum::<usize>() as f64;
         assert!((0.4..1.0).contains(&share), "{model:?}: {share}");

@@ -1,7 +1,7 @@
 //! The hub's session with a scanner of Slamtec: what it makes of the bytes beside what the scanner measured.
 
 use scanhub_drivers::Settings;
-use scanhub_drivers::line::grid::NO_RETURN;
+use scanhub_drivers::line::NO_RETURN;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Trouble};
 use scanhub_schema::{MILLIS, Nanos, line_time};
