@@ -2,12 +2,13 @@
 //! until it ends all threads in order.
 
 use std::collections::BTreeMap;
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::AsFd;
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
-use std::sync::mpsc;
-use std::thread;
+use std::sync::mpsc::{self, Receiver, Sender};
+use std::thread::{self, Scope, ScopedJoinHandle};
 
-use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_config::{Config, Link};
 use scanhub_port::{Port, Source, clock};
 use scanhub_schema::{Failure, Kind, MILLIS, Nanos};
@@ -19,7 +20,7 @@ use crate::link::LinkCore;
 use crate::platform::Platform as _;
 use crate::player::{Player, PlayerHandle};
 use crate::process::{
-    SignalAction, Signals, check_descriptors, check_memory, no_resource, raise_descriptor_limit,
+    EventFd, SignalAction, Signals, check_descriptors, check_memory, no_resource, raise_descriptor_limit,
 };
 use crate::reconnect::LiveLink;
 use crate::reload::{ConfigLoader, Reload};
@@ -118,25 +119,16 @@ pub(crate) fn serve(
     let signals = Signals::register()?;
     let lock = HubLock::acquire(domain.root())?;
     // A replay does not use the saved state of sensors.
-    let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none()).filter(|state| {
-        let checked = state.check();
-        if let Err(Failure { message, hint, .. }) = &checked {
-            tracing::warn!("nothing is kept across restarts: {message}; {hint}");
-        }
-        checked.is_ok()
-    });
+    let state = if set.is_none() { state_directory(domain) } else { None };
     check_descriptors(config.links.len())?;
     check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
-    // Ends after the links, and writes their last state.
     let (config, saver) = match state {
         Some(state) => StateSaver::load(config, state, clock::wall_ns())?,
         None => (config, None),
     };
     let writer = saver.map(StateWriter::start).transpose()?;
-    let config = &config;
     let node = scanhub_shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
-    let boot = random();
     // By the port, not by the name: a line that the service manager keeps cannot be opened again.
     service.assign(|line| {
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
@@ -144,76 +136,132 @@ pub(crate) fn serve(
     });
     let (mut control, queues) =
         ControlServer::open(&node, config.links.iter().map(|link| link.name.as_str()))?;
-    let stop = eventfd(0, EventfdFlags::CLOEXEC).map_err(|error| no_resource("an eventfd", &error))?;
-    let (player, parts, holds) = match set {
-        Some(ReplaySet { player, parts, holds }) => (Some(player), parts, holds),
-        None => (None, Vec::new(), true),
+    let (parts, end_of_playback) = match set {
+        Some(ReplaySet { player, parts, holds }) => {
+            (parts, Some(EndOfPlayback { player, holds, ends_at: None }))
+        }
+        None => (Vec::new(), None),
     };
-    let mut parts = parts.into_iter();
-    let worked: Vec<_> = config.links.iter().map(|_| AtomicBool::new(true)).collect();
+    let player = end_of_playback.as_ref().map(|end_of_playback| end_of_playback.player);
+    let hub = Hub {
+        boot: random(),
+        root: domain.root(),
+        node: &node,
+        service: &service,
+        player,
+        stop: EventFd::new()?,
+        worked: config.links.iter().map(|_| AtomicBool::new(true)).collect(),
+        config,
+        writer,
+    };
     thread::scope(|scope| {
         let (report, reports) = mpsc::channel();
         let mut threads = Vec::new();
-        for ((number, link), queue) in config.links.iter().enumerate().zip(queues) {
-            let resources = LinkResources {
-                node: &node,
-                limits: link.limits(&config.limits),
-                stop: &stop,
-                service: &service,
-                root: domain.root(),
-            };
-            let (report, worked) = (report.clone(), &worked[number]);
-            let save_slot = writer.as_ref().and_then(|writer| writer.queue().slot(&link.name));
-            let part = player
-                .zip(parts.next())
-                .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
-            let body = move || {
-                let report = |outcome| drop(report.send((number, outcome)));
-                let system = System::new(resources, &link.name, worked, save_slot);
-                run_link(link, number as u8, boot, &system, queue, part, report);
-            };
-            let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
-            match thread {
-                Ok(thread) => threads.push(thread),
-                Err(error) => {
-                    end_links(&stop);
-                    return Err(no_resource("a thread", &error));
-                }
-            }
-        }
+        let started = hub.start_links(scope, queues, parts, &report, &mut threads);
         drop(report);
-        // In the order of the links, although they report in any order.
-        let reports = reports.iter().take(config.links.len());
-        let starts: Result<BTreeMap<_, _>, _> =
-            reports.map(|(number, start)| start.map(|start| (number, start))).collect();
-        let outcome = starts.and_then(|starts| {
-            let names = |is_counted: fn(&Start) -> bool| {
-                let counted = starts.iter().filter(|(_, start)| is_counted(start));
-                counted.map(|(&number, _)| config.links[number].name.clone()).collect()
-            };
-            let ready = Ready {
-                boot,
-                sensors: config.links.iter().map(|link| link.name.clone()).collect(),
-                waiting: names(|start| *start != Start::Open),
-                taken: names(|start| *start == Start::Taken),
-            };
+        let outcome = started.and_then(|()| hub.await_starts(&reports)).and_then(|ready| {
             scanhub_shm::allocate(domain)?;
             lock.report_ready()?;
             on_ready(&ready);
             service.ready(&ready.sensors, None);
             player.iter().for_each(|player| player.begin());
             let is_alive = || threads.iter().all(|thread| !thread.is_finished());
-            let watchdog = Watchdog::new(&service, &worked, clock::now());
-            let reload = Reload::new(config, read, &service);
-            let end_of_playback = player.map(|player| EndOfPlayback { player, holds, ends_at: None });
+            let watchdog = Watchdog::new(&service, &hub.worked, clock::now());
+            let reload = Reload::new(&hub.config, read, &service);
             run_supervisor(&node, &signals, reload, &mut control, watchdog, end_of_playback, is_alive)
         });
         service.stopping();
-        end_links(&stop);
+        hub.stop.signal();
         // Joined one by one, a thread that panicked is a failure of this function, not a panic of its own.
         let ended = threads.into_iter().map(|thread| thread.join()).collect::<Result<Vec<()>, _>>();
         outcome.and(ended.map(drop).map_err(|_| broken_thread()))
     })
+}
+
+/// Parts of a hub that the threads of its links use.
+struct Hub<'a> {
+    config: Config,
+    /// Random ID of this run.
+    boot: u64,
+    /// Directory of the domain.
+    root: &'a Path,
+    node: &'a Node,
+    service: &'a Service,
+    /// Player of the recording that the links play.
+    player: Option<&'a Player>,
+    /// Ends the threads of the links.
+    stop: EventFd,
+    /// Set by each link when it has finished something.
+    worked: Vec<AtomicBool>,
+    /// Ends after the links, and writes their last state.
+    writer: Option<StateWriter>,
+}
+
+impl Hub<'_> {
+    /// Starts a thread for each link, and adds it to `threads`. Each one sends its number and the outcome of its start
+    /// to `report`.
+    fn start_links<'s>(
+        &'s self,
+        scope: &'s Scope<'s, '_>,
+        queues: Vec<ControlQueue>,
+        parts: Vec<Recorded>,
+        report: &Sender<(usize, Result<Start, Failure>)>,
+        threads: &mut Vec<ScopedJoinHandle<'s, ()>>,
+    ) -> Result<(), Failure> {
+        let mut parts = parts.into_iter();
+        for ((number, link), queue) in self.config.links.iter().enumerate().zip(queues) {
+            let resources = LinkResources {
+                node: self.node,
+                limits: link.limits(&self.config.limits),
+                stop: &self.stop,
+                service: self.service,
+                root: self.root,
+            };
+            let save_slot = self.writer.as_ref().and_then(|writer| writer.queue().slot(&link.name));
+            let part = self
+                .player
+                .zip(parts.next())
+                .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
+            let report = report.clone();
+            let body = move || {
+                let report = |outcome| drop(report.send((number, outcome)));
+                let system = System::new(resources, &link.name, &self.worked[number], save_slot);
+                run_link(link, number as u8, self.boot, &system, queue, part, report);
+            };
+            let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
+            threads.push(thread.map_err(|error| no_resource("a thread", &error))?);
+        }
+        Ok(())
+    }
+
+    /// Waits until all links have started.
+    fn await_starts(&self, reports: &Receiver<(usize, Result<Start, Failure>)>) -> Result<Ready, Failure> {
+        let links = &self.config.links;
+        // In the order of the links, although they report in any order.
+        let reports = reports.iter().take(links.len());
+        let starts: BTreeMap<_, _> =
+            reports.map(|(number, start)| Ok((number, start?))).collect::<Result<_, Failure>>()?;
+        let names = |is_counted: fn(&Start) -> bool| {
+            let counted = starts.iter().filter(|(_, start)| is_counted(start));
+            counted.map(|(&number, _)| links[number].name.clone()).collect()
+        };
+        Ok(Ready {
+            boot: self.boot,
+            sensors: links.iter().map(|link| link.name.clone()).collect(),
+            waiting: names(|start| *start != Start::Open),
+            taken: names(|start| *start == Start::Taken),
+        })
+    }
+}
+
+/// Returns the directory for state that outlives a hub in `domain`, if it can be used.
+fn state_directory(domain: &Domain) -> Option<StateDirectory> {
+    let state = StateDirectory::of_domain(domain.name())?;
+    if let Err(Failure { message, hint, .. }) = state.check() {
+        tracing::warn!("nothing is kept across restarts: {message}; {hint}");
+        return None;
+    }
+    Some(state)
 }
 
 /// Runs `link`, number `number` in the run `boot` of the hub, until the hub ends. A recording is played as `part` of
@@ -296,11 +344,6 @@ fn run_supervisor(
             cleanup_at = now + CLEANUP_INTERVAL;
         }
     }
-}
-
-fn end_links(stop: &OwnedFd) {
-    // An eventfd that no thread reads accepts one write.
-    let _ = rustix::io::write(stop, &1u64.to_ne_bytes());
 }
 
 fn broken_thread() -> Failure {

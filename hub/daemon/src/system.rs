@@ -3,7 +3,7 @@
 use std::cell::{Cell, OnceCell, RefCell};
 use std::fs::File;
 use std::io;
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,6 +19,7 @@ use scanhub_shm::{Node, Payload, SharedMemory, Waker};
 use crate::control::ControlQueue;
 use crate::link::LinkCore;
 use crate::platform::{Line, Platform, SavedState, Wait, WaitSource, WakeReason};
+use crate::process::EventFd;
 use crate::reconnect::LiveLink;
 use crate::saved_state::SaveSlot;
 use crate::service::Service;
@@ -55,7 +56,7 @@ pub(crate) struct LinkResources<'a> {
     /// Limits of the link's topics.
     pub(crate) limits: TopicLimits,
     /// Readable once the hub must end.
-    pub(crate) stop: &'a OwnedFd,
+    pub(crate) stop: &'a EventFd,
     /// Keeps the ports open if the hub is killed.
     pub(crate) service: &'a Service,
     /// The domain's directory.
