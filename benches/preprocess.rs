@@ -58,7 +58,7 @@ fn check(c: &mut Criterion) {
         ("zones, 8 circles, off the centre", POSE, &eight),
     ];
     for (name, pose, radii_mm) in cases {
-        let settings = zones::Settings { radii_mm, ..zones::Settings::default() };
+        let settings = zones::Settings { radii_mm: radii_mm.to_vec(), ..zones::Settings::default() };
         let mut check = zones::Check::new(pose, &settings, BEAMS);
         let mut out = Zones::default();
         bench(c, name, &scans, |scan| check.update(scan, black_box(&mut out)));

@@ -51,7 +51,7 @@ pub(crate) struct Gateway {
 
 impl Gateway {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
-        let options = self.over(scanhub_config::Gateway::load(&self.configured.sources())?, everywhere)?;
+        let options = self.over(&self.configured.sources().read(), everywhere)?;
         if self.topics.is_empty() {
             // They come from the configuration.
             options.check().map_err(of_section)?;
@@ -61,17 +61,16 @@ impl Gateway {
 
     /// Checks that a gateway accepts the section in `sources`.
     pub(super) fn check(sources: &SourceMap, everywhere: &Everywhere) -> Result<(), Failure> {
-        let checked = Gateway::default().over(scanhub_config::Gateway::of(sources)?, everywhere)?.check();
-        checked.map_err(of_section)
+        Gateway::default().over(sources, everywhere)?.check().map_err(of_section)
     }
 
-    /// These flags, and the values `said` in the section where a flag is missing.
-    fn over(
-        &self,
-        said: scanhub_config::Gateway,
-        everywhere: &Everywhere,
-    ) -> Result<GatewayOptions, Failure> {
-        let every = background_every(&said)?;
+    /// Returns these flags, and values of the section in `sources` where a flag is missing.
+    fn over(&self, sources: &SourceMap, everywhere: &Everywhere) -> Result<GatewayOptions, Failure> {
+        let said = scanhub_config::Gateway::of(sources)?;
+        let every = said.background_every.map(|text| duration::parse(&text)).transpose().map_err(|what| {
+            let place = scanhub_config::Gateway::background_every_place(sources).unwrap_or_default();
+            Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m")
+        })?;
         let or = |flags: &[String], said: Option<Vec<String>>| match flags {
             [] => said.unwrap_or_default(),
             flags => flags.to_vec(),
@@ -82,9 +81,9 @@ impl Gateway {
             to: or(&self.to, said.to),
             bare: self.bare || said.bare.unwrap_or_default(),
             key_file: self.key_file.clone().or(said.key_file),
-            ttl: self.ttl.or(said.ttl).unwrap_or(scanhub_config::Gateway::TTL),
+            ttl: self.ttl.unwrap_or(said.ttl.unwrap_or(scanhub_config::Gateway::TTL) as u8),
             background_every: self.background_every.or(every),
-            longest: self.mtu.or(said.mtu).unwrap_or(scanhub_config::Gateway::MTU),
+            longest: self.mtu.unwrap_or(said.mtu.unwrap_or(scanhub_config::Gateway::MTU) as usize),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => GatewayLook::Json,
                 (false, true) => GatewayLook::Terminal,
@@ -97,16 +96,6 @@ impl Gateway {
 
 fn of_section(failure: Failure) -> Failure {
     Failure::new(Kind::Configuration, format!("section gateway: {}", failure.message), failure.hint)
-}
-
-/// How often the configuration has the background sent.
-fn background_every(said: &scanhub_config::Gateway) -> Result<Option<Duration>, Failure> {
-    let every = said.background_every.as_ref().map(|(text, place)| {
-        let refuse =
-            |what| Failure::new(Kind::Configuration, format!("{place}: {what}"), "write 10s, 250ms, 5m");
-        duration::parse(text).map_err(refuse)
-    });
-    every.transpose()
 }
 
 /// Returns the groups and their topics, for the end of the help.

@@ -23,8 +23,8 @@ pub(super) fn processors(data: &[u8]) {
     let mut check = zones::Check::new(
         pose,
         &zones::Settings {
-            radii_mm: &radii_mm,
-            self_min: &self_min,
+            radii_mm: radii_mm.clone(),
+            self_min,
             margin_mm: bytes.u16(),
             min_beams: bytes.u16(),
             min_scans: u16::from(bytes.u8()),

@@ -7,7 +7,7 @@ use scanhub_schema::{Failure, Family};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 
-use crate::gateway::{GatewayKeys, LimitsKeys};
+use crate::gateway::{Gateway, LimitsKeys};
 use crate::link::{Link, LinkKeys};
 use crate::load::{Merged, MergedLink};
 use crate::processing::has_key;
@@ -78,7 +78,7 @@ fn of_link(merged: &Merged<'_>, link: &Link, read: &MergedLink<'_>) -> Vec<Value
 
 /// Returns the keys of a link, and of each section under its name, with their default values as TOML; `-` for a key without.
 pub fn keys() -> Vec<(&'static str, Vec<(Key, String)>)> {
-    let (link, limits, gateway) = (LinkKeys::default(), LimitsKeys::default(), GatewayKeys::default());
+    let (link, limits, gateway) = (LinkKeys::default(), LimitsKeys::default(), Gateway::default());
     let keys_of = |section: &dyn Section, values: Vec<(&str, Json)>| {
         let defaults = values.into_iter().map(|(_, value)| TomlValue(&value).to_string());
         section.keys().iter().copied().zip(defaults).collect()

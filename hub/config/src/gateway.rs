@@ -22,8 +22,8 @@ section! {
 }
 
 section! {
-    /// Keys of section `gateway`.
-    pub(crate) struct GatewayKeys: "keys of gateway, as { interface = \"eth0\" }" {
+    /// Section `gateway`; `None` for keys that are not set.
+    pub struct Gateway: "keys of gateway, as { interface = \"eth0\" }" {
         /// for the multicast groups; no default
         ///
         /// Network interface on which the multicast groups are sent.
@@ -56,49 +56,11 @@ section! {
     }
 }
 
-/// Settings of the gateway; `None` for those that are not set.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Gateway {
-    /// Name of the network interface.
-    pub interface: Option<String>,
-    /// `SENSOR/TOPIC` or `*/TOPIC`, possibly with `:every=N`.
-    pub topics: Option<Vec<String>>,
-    /// `HOST:PORT` of each receiver of a copy.
-    pub to: Option<Vec<String>>,
-    /// Whether datagrams are telegrams without a header.
-    pub bare: Option<bool>,
-    /// File with the key for the MAC of datagrams.
-    pub key_file: Option<PathBuf>,
-    /// Maximum number of networks that a datagram crosses.
-    pub ttl: Option<u8>,
-    /// A duration, and the place where it is set.
-    pub background_every: Option<(String, String)>,
-    /// Maximum length of a datagram in bytes.
-    pub mtu: Option<usize>,
-}
-
 impl Gateway {
     /// Default of [`ttl`](Self::ttl).
-    pub const TTL: u8 = 1;
+    pub const TTL: i64 = 1;
     /// Default of [`mtu`](Self::mtu).
-    pub const MTU: usize = MTU_SAFE;
-}
-
-impl GatewayKeys {
-    /// Returns the settings of the gateway. `every_place` is where `background_every` is set.
-    pub(crate) fn settings(self, every_place: Option<String>) -> Gateway {
-        let GatewayKeys { interface, topics, to, bare, key_file, ttl, background_every, mtu } = self;
-        Gateway {
-            interface,
-            topics,
-            to,
-            bare,
-            key_file,
-            ttl: ttl.map(|ttl| ttl as u8),
-            background_every: background_every.zip(every_place),
-            mtu: mtu.map(|mtu| mtu as usize),
-        }
-    }
+    pub const MTU: i64 = MTU_SAFE as i64;
 
     /// Returns keys and values in effect.
     pub(crate) fn shown(&self) -> Vec<(&'static str, Json)> {

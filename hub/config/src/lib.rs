@@ -13,7 +13,7 @@ mod sources;
 pub use effective::{Value, keys, values};
 pub use gateway::Gateway;
 pub use link::{Config, Link, needs};
-pub use processing::{Background, Processing, Zones};
+pub use processing::{Background, Processing};
 pub use scanner::Scanner;
 pub use section::Key;
 pub use sources::{SourceMap, Sources};

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use crate::gateway::{Gateway, GatewayKeys, LimitsKeys};
+use crate::gateway::{Gateway, LimitsKeys};
 use crate::link::{Config, Link, LinkKeys, MAX_LINKS};
 use crate::processing::{
     BackgroundKeys, EarlyKeys, LinesKeys, MarksKeys, MotionKeys, Processing, ZonesKeys, check_coverage,
@@ -34,7 +34,7 @@ pub(crate) struct Document {
     background: BackgroundKeys,
     early: EarlyKeys,
     pub(crate) limits: LimitsKeys,
-    pub(crate) gateway: GatewayKeys,
+    pub(crate) gateway: Gateway,
 }
 
 impl Document {
@@ -203,8 +203,18 @@ impl<'a> Merged<'a> {
         Ok(Config { links, limits })
     }
 
+    /// Merges the section of the gateway alone.
+    fn of_gateway(sources: &'a SourceMap) -> Result<Merged<'a>, Failure> {
+        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
+        for (_, table, document) in sources.layers::<Document>()? {
+            check_section("gateway", &document.gateway, &table, sources)?;
+            overlay(&mut merged.general, table);
+        }
+        Ok(merged)
+    }
+
     /// Returns the section of the gateway.
-    pub(crate) fn gateway(&self) -> Result<GatewayKeys, Failure> {
+    pub(crate) fn gateway(&self) -> Result<Gateway, Failure> {
         self.gateway.clone()?;
         self.section("gateway")
     }
@@ -296,27 +306,18 @@ impl Config {
 }
 
 impl Gateway {
-    /// Reads the section in all sources; the last one wins. Links are not required.
+    /// Merges the section in all `sources`; the last one wins. Links are not required.
     ///
     /// # Errors
     ///
     /// Returns [`scanhub_schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
-    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
-        Gateway::of(&sources.read())
+    pub fn of(sources: &SourceMap) -> Result<Gateway, Failure> {
+        Merged::of_gateway(sources)?.section("gateway")
     }
 
-    /// Merges sources that were read.
-    ///
-    /// # Errors
-    ///
-    /// As those of [`load`](Self::load).
-    pub fn of(sources: &SourceMap) -> Result<Gateway, Failure> {
-        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
-        for (_, table, document) in sources.layers::<Document>()? {
-            check_section("gateway", &document.gateway, &table, sources)?;
-            overlay(&mut merged.general, table);
-        }
-        Ok(merged.section::<GatewayKeys>("gateway")?.settings(merged.place("gateway.background_every")))
+    /// Returns the place in `sources` where `background_every` is set.
+    pub fn background_every_place(sources: &SourceMap) -> Option<String> {
+        Merged::of_gateway(sources).ok()?.place("gateway.background_every")
     }
 }
 

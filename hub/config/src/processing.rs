@@ -23,7 +23,7 @@ pub struct Processing {
     /// Pose of the sensor.
     pub pose: Pose,
     /// Zones around the robot.
-    pub zones: Zones,
+    pub zones: zones::Settings,
     /// Detection of reflector marks.
     pub marks: marks::Settings,
     /// Detection of straight lines.
@@ -41,43 +41,6 @@ pub struct Processing {
 pub struct Early {
     /// Number of reads per LMS telegram while the topic has a subscriber, 2 to 8.
     pub pieces: u8,
-}
-
-/// Values of section `[zones]`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Zones {
-    /// Radii around the robot's center in mm, the largest first, 1 to 8.
-    pub radii_mm: Vec<u16>,
-    /// Sectors that the robot's own body covers.
-    pub self_min: Vec<zones::Sector>,
-    /// Margin that is added to every radius, in mm.
-    pub margin_mm: u16,
-    /// Minimum number of beams of a violation.
-    pub min_beams: u16,
-    /// Minimum number of consecutive scans of a violation.
-    pub min_scans: u16,
-    /// Maximum share of the beams through the largest zone that may have no reading.
-    pub max_invalid: f64,
-    /// Whether points in front of the near side of a zone do not count as inside it, if the sensor is outside the zone.
-    pub exact: bool,
-    /// Whether a beam without an echo means that nothing is near.
-    pub no_return_is_far: bool,
-}
-
-impl Zones {
-    /// Returns the settings of the processor.
-    pub fn settings(&self) -> zones::Settings<'_> {
-        zones::Settings {
-            radii_mm: &self.radii_mm,
-            self_min: &self.self_min,
-            margin_mm: self.margin_mm,
-            min_beams: self.min_beams,
-            min_scans: self.min_scans,
-            max_invalid: self.max_invalid,
-            exact: self.exact,
-            no_return_is_far: self.no_return_is_far,
-        }
-    }
 }
 
 /// Values of section `[background]`.
@@ -373,7 +336,7 @@ impl Processing {
                 upside_down: pose.upside_down.into(),
                 ..Pose::default()
             },
-            zones: Zones {
+            zones: zones::Settings {
                 radii_mm: zones.radii.iter().copied().map(in_mm).collect(),
                 self_min: zones.self_min.iter().filter_map(SectorKeys::sector).collect(),
                 margin_mm: in_mm(zones.margin),
@@ -591,7 +554,7 @@ pub(crate) fn check_coverage(
     sources: &SourceMap,
 ) -> Result<(), Failure> {
     let processing = &link.processing;
-    let settings = processing.zones.settings();
+    let settings = &processing.zones;
     let (beams, min_beams) = (link.scan_heads()[0].count.into(), settings.min_beams);
     let refuse = |keys: &[&str], what: String, remedy: &str| {
         let spans = keys.iter().filter_map(|key| find(table, key).map(Spanned::span));
@@ -606,7 +569,7 @@ pub(crate) fn check_coverage(
         return refuse(&["zones.min_beams"], what, "the default is one beam");
     }
     // The maximum number of beams that can detect something in the largest zone.
-    let detecting = |settings: &zones::Settings<'_>| {
+    let detecting = |settings: &zones::Settings| {
         let of_head = |head: &ScanHead| {
             let beams = usize::from(head.count);
             let mut check = Check::new(processing.pose, settings, beams);
@@ -615,12 +578,12 @@ pub(crate) fn check_coverage(
         };
         link.scan_heads().iter().map(of_head).max().unwrap_or_default()
     };
-    let seeing = detecting(&settings);
+    let seeing = detecting(settings);
     if seeing >= min_beams {
         return Ok(());
     }
     let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
-    if detecting(&zones::Settings { self_min: &[], ..settings }) == 0 {
+    if detecting(&zones::Settings { self_min: Vec::new(), ..settings.clone() }) == 0 {
         return refuse(
             &["pose.x", "pose.y", "pose.yaw"],
             format!("no beam sees into the circle of {circle_m} m"),

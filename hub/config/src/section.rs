@@ -33,7 +33,7 @@ macro_rules! section {
         #[derive(Clone, Debug, PartialEq, serde::Deserialize, serde::Serialize)]
         #[serde(default, deny_unknown_fields, expecting = $expecting)]
         $vis struct $section {
-            $($(#[doc = $doc])+ $(#[serde(rename = $name)])? pub(crate) $field: $type,)+
+            $($(#[doc = $doc])+ $(#[serde(rename = $name)])? $vis $field: $type,)+
         }
 
         impl Default for $section {

@@ -353,23 +353,28 @@ fn the_gateway_has_a_section_that_needs_no_links() {
             set: set.iter().map(|flag| (*flag).to_owned()).collect(),
             links: Vec::new(),
         };
-        Gateway::load(&sources).map_err(|failure| failure.to_string())
+        let sources = sources.read();
+        let gateway = Gateway::of(&sources).map_err(|failure| failure.to_string())?;
+        Ok::<_, String>((gateway, Gateway::background_every_place(&sources)))
     };
     let place = format!("{}:2:20", second.0.display());
     assert_eq!(
         gateway(&[&first, &second], &["gateway.ttl=3", "gateway.bare=true"]).unwrap(),
-        Gateway {
-            interface: Some("eth0".into()),
-            topics: Some(Vec::new()),
-            to: None,
-            bare: Some(true),
-            key_file: Some("/k".into()),
-            ttl: Some(3),
-            background_every: Some(("10s".into(), place)),
-            mtu: None,
-        }
+        (
+            Gateway {
+                interface: Some("eth0".into()),
+                topics: Some(Vec::new()),
+                to: None,
+                bare: Some(true),
+                key_file: Some("/k".into()),
+                ttl: Some(3),
+                background_every: Some("10s".into()),
+                mtu: None,
+            },
+            Some(place)
+        )
     );
-    assert_eq!(gateway(&[], &[]).unwrap(), Gateway::default());
+    assert_eq!(gateway(&[], &[]).unwrap(), (Gateway::default(), None));
     // A hub takes the same files.
     let links = Scratch::new("gateway-links.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n");
     assert_eq!(load(&[&first, &links], &[]).unwrap().links.len(), 1);

@@ -144,7 +144,7 @@ fn what_is_shown_can_be_set() {
     let set: Vec<&str> = set.iter().map(String::as_str).collect();
     assert!(set.len() >= 50, "{set:?}");
     assert_eq!(Config::load(&of(&set)), Config::load(&of(&said)));
-    let gateway = Gateway::load(&of(&set)).unwrap();
+    let gateway = Gateway::of(&of(&set).read()).unwrap();
     assert_eq!((gateway.ttl, gateway.mtu), (Some(3), Some(1372)));
 }
 

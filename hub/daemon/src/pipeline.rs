@@ -81,7 +81,7 @@ impl Pipeline {
     pub(crate) fn new(processing: &Processing, beams: usize) -> Pipeline {
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = processing;
         Pipeline {
-            zones: Check::new(*pose, &zones.settings(), beams),
+            zones: Check::new(*pose, zones, beams),
             marks: MarkDetector::new(*marks),
             lines: LineFinder::new(*pose, *lines, beams),
             motion: MotionEstimator::new(*pose, *motion, beams),
@@ -107,7 +107,7 @@ impl Pipeline {
         let before = std::mem::replace(&mut self.processing, processing.clone());
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = &self.processing;
         if (pose, zones) != (&before.pose, &before.zones) {
-            self.zones = Check::new(*pose, &zones.settings(), self.beams);
+            self.zones = Check::new(*pose, zones, self.beams);
         }
         self.marks = MarkDetector::new(*marks);
         self.lines.change(*pose, *lines);

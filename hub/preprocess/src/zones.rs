@@ -24,12 +24,12 @@ pub struct Sector {
 pub const SECTORS: usize = 64;
 
 /// Settings of a check.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Settings<'a> {
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
     /// Radii of the circles, the largest first, at most [`ZONES`]. More are ignored.
-    pub radii_mm: &'a [u16],
+    pub radii_mm: Vec<u16>,
     /// The robot's own body. Where sectors overlap, the largest range counts.
-    pub self_min: &'a [Sector],
+    pub self_min: Vec<Sector>,
     /// Distance that is added to a circle along every beam that meets it.
     pub margin_mm: u16,
     /// Number of beams of a scan that violate a zone; 0 counts as 1.
@@ -44,12 +44,12 @@ pub struct Settings<'a> {
     pub no_return_is_far: bool,
 }
 
-impl Default for Settings<'static> {
+impl Default for Settings {
     /// Returns 1 m and 0.6 m (paper III.B.1), one beam, one scan. A tenth of the beams may be invalid.
     fn default() -> Self {
         Settings {
-            radii_mm: &[1000, 600],
-            self_min: &[],
+            radii_mm: vec![1000, 600],
+            self_min: Vec::new(),
             margin_mm: 0,
             min_beams: 1,
             min_scans: 1,
@@ -96,7 +96,7 @@ pub struct Check {
 
 impl Check {
     /// Creates a check for a sensor at `pose` with at most `beams` beams. More are ignored.
-    pub fn new(pose: Pose, settings: &Settings<'_>, beams: usize) -> Check {
+    pub fn new(pose: Pose, settings: &Settings, beams: usize) -> Check {
         Check {
             min_beams: settings.min_beams.max(1),
             min_scans: settings.min_scans.max(1),
@@ -280,7 +280,7 @@ struct Met {
 
 impl Table {
     /// Creates a table for a sensor with at most `beams` beams.
-    fn new(pose: Pose, settings: &Settings<'_>, beams: usize) -> Table {
+    fn new(pose: Pose, settings: &Settings, beams: usize) -> Table {
         let circles = settings.radii_mm.len().min(ZONES);
         let mut radii_mm = [0; ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);

@@ -16,7 +16,7 @@ fn scan(random: &mut Rng, near: usize) -> Box<Scan> {
 }
 
 /// What a new check says of the last of `scans` after the others.
-fn told(pose: Pose, settings: &Settings<'_>, scans: &[Box<Scan>]) -> Zones {
+fn told(pose: Pose, settings: &Settings, scans: &[Box<Scan>]) -> Zones {
     let (mut check, mut out) = (Check::new(pose, settings, BEAMS), Zones::unknown());
     scans.iter().for_each(|scan| check.update(scan, &mut out));
     out

@@ -18,7 +18,7 @@ fn told(check: &mut Check, scan: &Scan) -> Zones {
     out
 }
 
-fn verdict(settings: &Settings<'_>, scan: &Scan) -> Verdict {
+fn verdict(settings: &Settings, scan: &Scan) -> Verdict {
     told(&mut Check::new(Pose::default(), settings, 100), scan).verdict()
 }
 
@@ -93,14 +93,14 @@ fn the_robot_itself_is_neither_near_nor_invalid() {
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
     let blind: Vec<_> = (0..11).map(|i| (i, INVALID)).collect();
     for (self_min, of_blind) in [(&partly[..], Verdict::Unknown), (&wholly[..], Verdict::Clear)] {
-        let settings = Settings { self_min, ..Settings::default() };
+        let settings = Settings { self_min: self_min.to_vec(), ..Settings::default() };
         assert_eq!(verdict(&settings, &scan(&body[..11])), Verdict::Clear);
         assert_eq!(verdict(&settings, &scan(&body)), Verdict::Stop, "beam 11 is none of the body's");
         assert_eq!(verdict(&settings, &scan(&blind)), of_blind);
         let mut check = Check::new(Pose::default(), &settings, 100);
         assert_eq!(told(&mut check, &scan(&body[..11])).nearest(), Some((11, 5000)));
     }
-    let settings = Settings { self_min: &partly, ..Settings::default() };
+    let settings = Settings { self_min: partly.to_vec(), ..Settings::default() };
     assert_eq!(verdict(&settings, &scan(&[(3, 400)])), Verdict::Stop, "where the body ends");
 }
 
@@ -108,7 +108,10 @@ fn the_robot_itself_is_neither_near_nor_invalid() {
 fn who_is_told_nothing_knows_nothing() {
     let settings = Settings::default();
     assert_eq!(verdict(&settings, &Box::<Scan>::default()), Verdict::Unknown);
-    assert_eq!(verdict(&Settings { radii_mm: &[], ..settings }, &scan(&[(7, 500)])), Verdict::Unknown);
+    assert_eq!(
+        verdict(&Settings { radii_mm: Vec::new(), ..Settings::default() }, &scan(&[(7, 500)])),
+        Verdict::Unknown
+    );
     for (x_m, yaw_rad) in [(f64::NAN, 0.0), (0.0, f64::INFINITY), (f64::INFINITY, 0.0)] {
         let mut check = Check::new(Pose { x_m, yaw_rad, ..Pose::default() }, &settings, 100);
         assert_eq!(told(&mut check, &scan(&[])).verdict(), Verdict::Unknown);
@@ -132,20 +135,23 @@ fn an_old_scan_is_never_clear() {
 #[test]
 fn a_circle_that_cannot_be_violated_is_never_clear() {
     let settings = Settings::default();
-    let of = |pose: Pose, settings: &Settings<'_>, scan: &Scan| {
+    let of = |pose: Pose, settings: &Settings, scan: &Scan| {
         let mut check = Check::new(pose, settings, 100);
         (told(&mut check, scan).verdict(), check.telling(), check.is_blind())
     };
     let whole = Pose::default();
-    let most = Settings { min_beams: 100, ..settings };
+    let most = Settings { min_beams: 100, ..settings.clone() };
     assert_eq!(of(whole, &most, &scan(&[])), (Verdict::Clear, 100, false));
-    let more = Settings { min_beams: 101, ..settings };
+    let more = Settings { min_beams: 101, ..settings.clone() };
     assert_eq!(of(whole, &more, &scan(&[(7, 0)])), (Verdict::Unknown, 100, true));
     let body = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 1000 }];
-    let masked = Settings { self_min: &body, ..most };
+    let masked = Settings { self_min: body.to_vec(), ..most.clone() };
     assert_eq!(of(whole, &masked, &scan(&[])), (Verdict::Unknown, 89, true));
     let all = [Sector { to_mdeg: 90_000, ..body[0] }];
-    assert_eq!(of(whole, &Settings { self_min: &all, ..settings }, &scan(&[])).0, Verdict::Unknown);
+    assert_eq!(
+        of(whole, &Settings { self_min: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
+        Verdict::Unknown
+    );
     // 2 m ahead of the centre it looks away from the circle; turned about, into it.
     let away = Pose { x_m: 2.0, ..Pose::default() };
     assert_eq!(of(away, &settings, &scan(&[])), (Verdict::Unknown, 0, true));
@@ -183,7 +189,7 @@ fn turn(beams: &[(usize, u16, f32)]) -> Box<Scan> {
     scan
 }
 
-fn of_turn(pose: Pose, settings: &Settings<'_>, scan: &Scan) -> Zones {
+fn of_turn(pose: Pose, settings: &Settings, scan: &Scan) -> Zones {
     told(&mut Check::new(pose, settings, 200), scan)
 }
 
@@ -201,7 +207,7 @@ fn the_exact_point_counts_where_there_is_one() {
     assert_eq!(of_turn(ahead, &settings, &turn(&[(100, 1001, -182.6)])).zones()[0].beams, 0);
     // The middle of bin 99 is beside the robot's body, a point in it may not be.
     let body = [Sector { from_mdeg: -180_000, to_mdeg: -179_000, range_mm: 2000 }];
-    let masked = Settings { self_min: &body, ..settings };
+    let masked = Settings { self_min: body.to_vec(), ..settings };
     assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
     assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -179.3)])).zones()[0].beams, 0);
 }

@@ -11,35 +11,33 @@ use scanhub_schema::{Pose, Scan, ScanHead, Verdict, Zones};
 /// One random configuration.
 struct Case {
     pose: Pose,
-    radii: Vec<u16>,
-    sectors: Vec<Sector>,
-    settings: Settings<'static>,
+    settings: Settings,
 }
 
 impl Case {
     fn new(random: &mut Rng) -> Case {
-        let mut radii: Vec<u16> = (0..random.usize(1..=8)).map(|_| random.u16(50..3000)).collect();
-        radii.sort_unstable_by(|a, b| b.cmp(a));
+        let mut radii_mm: Vec<u16> = (0..random.usize(1..=8)).map(|_| random.u16(50..3000)).collect();
+        radii_mm.sort_unstable_by(|a, b| b.cmp(a));
         let sectors = (0..random.usize(..4)).map(|_| {
             let from_mdeg = 250 * random.i32(-360..360);
             Sector { from_mdeg, to_mdeg: from_mdeg + 250 * random.i32(0..80), range_mm: random.u16(..2000) }
         });
-        let sectors = sectors.collect();
+        let self_min = sectors.collect();
         let settings = Settings {
+            radii_mm,
+            self_min,
             margin_mm: if random.bool() { 0 } else { random.u16(..200) },
             min_beams: random.u16(1..4),
             min_scans: random.u16(1..4),
             max_invalid: [0.0, 0.05, 0.1, 0.5][random.usize(..4)],
             exact: random.u8(..3) > 0,
             no_return_is_far: random.bool(),
-            ..Settings::default()
         };
-        Case { pose: scans::pose(random), sectors, radii, settings }
+        Case { pose: scans::pose(random), settings }
     }
 
     fn check(&self) -> Check {
-        let (radii_mm, self_min) = (&self.radii[..], &self.sectors[..]);
-        Check::new(self.pose, &Settings { radii_mm, self_min, ..self.settings }, 401)
+        Check::new(self.pose, &self.settings, 401)
     }
 
     /// Direction of a beam and what the robot's own body takes of it, in mm.
@@ -48,7 +46,8 @@ impl Case {
         let sense = if self.pose.upside_down == 1 { -1.0 } else { 1.0 };
         let angle = self.pose.yaw_rad + sense * (f64::from(mdeg) / 1000.0).to_radians();
         let covers = |sector: &&Sector| sector.from_mdeg <= mdeg && mdeg <= sector.to_mdeg;
-        let own = self.sectors.iter().filter(covers).map(|sector| sector.range_mm).max().unwrap_or(0);
+        let own =
+            self.settings.self_min.iter().filter(covers).map(|sector| sector.range_mm).max().unwrap_or(0);
         ([angle.cos(), angle.sin()], f64::from(own))
     }
 
@@ -81,7 +80,7 @@ impl Case {
     /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the
     /// robot's own body and the circle's near side, if any.
     fn tells(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
-        let (unit, radius) = (scans::unit_mm(scan), f64::from(self.radii[0]));
+        let (unit, radius) = (scans::unit_mm(scan), f64::from(self.settings.radii_mm[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();
         let values = [shortest, shortest + 1.0].into_iter().filter(|value| *value < f64::from(max(scan) - 8));
         values.into_iter().any(|value| self.violates(u, own, value * unit, radius))
@@ -104,7 +103,8 @@ impl Case {
         let broken = [0, 0, 20, 100][random.usize(..4)];
         for i in 0..usize::from(scan.count) {
             let (u, own) = self.beam(scan, i);
-            let (lo, hi) = self.chord(u, f64::from(self.radii[random.usize(..self.radii.len())]));
+            let (lo, hi) = self
+                .chord(u, f64::from(self.settings.radii_mm[random.usize(..self.settings.radii_mm.len())]));
             let near = [lo, hi, own][random.usize(..3)] / scans::unit_mm(scan) + 2.0;
             let anywhere = random.u16(..max - 8);
             let value = match random.u8(..4) {
@@ -143,8 +143,8 @@ fn told(scan: &Scan, i: usize, no_return_is_far: bool) -> Told {
 /// The formula and geometry over one scan: asserts what `out` says of it, but for the verdict.
 fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
     let mut tally = Tally::default();
-    let mut beams = vec![0; case.radii.len()];
-    let mut geometric = vec![(0, 0); case.radii.len()];
+    let mut beams = vec![0; case.settings.radii_mm.len()];
+    let mut geometric = vec![(0, 0); case.settings.radii_mm.len()];
     let (mut invalid, mut telling) = (0_u16, 0_u16);
     let mut nearest: Option<(f64, usize)> = None;
     for i in 0..usize::from(scan.count) {
@@ -159,7 +159,7 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
                 continue;
             }
         };
-        for (zone, radius) in case.radii.iter().map(|&radius| f64::from(radius)).enumerate() {
+        for (zone, radius) in case.settings.radii_mm.iter().map(|&radius| f64::from(radius)).enumerate() {
             beams[zone] += u16::from(case.violates(u, own, range, radius));
             let distance = case.distance(u, range);
             let (surely, perhaps) = (distance < radius - 1.0, distance < radius + 1.0);
@@ -222,7 +222,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
         // Another unit is another layout, and all begins anew.
         for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
-            let mut streaks = vec![0; case.radii.len()];
+            let mut streaks = vec![0; case.settings.radii_mm.len()];
             let mut seen = 0;
             for _ in 0..SCANS {
                 seen += 1;
@@ -263,7 +263,7 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
 /// An object stays inside the circle, and one scan in between cannot show it.
 #[test]
 fn after_an_invalid_scan_the_verdict_is_not_clear_before_it_is_proven() {
-    let settings = Settings { radii_mm: &[1000, 600], min_scans: 2, ..Settings::default() };
+    let settings = Settings { radii_mm: vec![1000, 600], min_scans: 2, ..Settings::default() };
     let mut check = Check::new(Pose::default(), &settings, 181);
     let head = ScanHead::lms(181, -90_000, 1000, 1, 13);
     let scan = |range: u16| Scan::of(head, &[range; 181]);
@@ -304,7 +304,7 @@ fn on_a_circle_is_outside_wherever_it_is_seen_from() {
                 upside_down: turn as u8 & 1,
                 ..Pose::default()
             };
-            let mut check = Check::new(pose, &Settings { radii_mm: &[1000], ..Settings::default() }, 1);
+            let mut check = Check::new(pose, &Settings { radii_mm: vec![1000], ..Settings::default() }, 1);
             let mut is_inside = |unit_mm: u16, range_mm: u16| {
                 let scan = Scan::of(ScanHead::lms(1, 0, 500, unit_mm.into(), 13), &[range_mm / unit_mm]);
                 let mut out = dirty();
