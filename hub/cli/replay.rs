@@ -53,7 +53,7 @@ impl Replay {
             return Err(Failure::new(Kind::Usage, message, "both count from the first telegram"));
         }
         Ok(PlaybackOptions {
-            pace: self.rate,
+            rate: self.rate,
             start_ns: nanos(start),
             end_ns: self.end.map(nanos),
             is_looped: self.is_looped,

@@ -55,7 +55,7 @@ fn wipe() {
 
 /// What was played, when it is over.
 pub(super) fn summary(played: &Progress) -> String {
-    let Progress { telegrams, position_ns, took_ns, paused_ns, pace, lap, .. } = *played;
+    let Progress { telegrams, position_ns, took_ns, paused_ns, rate, lap, .. } = *played;
     let span = |ns: u64| match ns {
         ..1_000_000_000 => format!("{} ms", ns.div_ceil(1_000_000)),
         _ => format!("{:.1} s", ns as f64 / 1e9),
@@ -65,7 +65,7 @@ pub(super) fn summary(played: &Progress) -> String {
     if paused_ns > 0 {
         words += &format!(" and {} of pauses", span(paused_ns));
     }
-    if pace == PlaybackRate::Max && lap == 0 && took_ns > 0 {
+    if rate == PlaybackRate::Max && lap == 0 && took_ns > 0 {
         words += &format!(", {:.0} times as fast as it was recorded", position_ns as f64 / took_ns as f64);
     }
     words
@@ -79,7 +79,7 @@ fn text(progress: &Progress, columns: usize) -> String {
 
 /// Whole parts, the fewer the greater `brevity` is: first goes what helps least.
 fn text_of(progress: &Progress, brevity: u32) -> String {
-    let Progress { position_ns, length_ns, pace, is_paused, is_over, lap, telegrams, .. } = *progress;
+    let Progress { position_ns, length_ns, rate, is_paused, is_over, lap, telegrams, .. } = *progress;
     let mut text = clock(position_ns);
     if let Some(length_ns) = length_ns.filter(|length_ns| *length_ns > 0 && brevity < 6) {
         let places = if brevity < 1 { BAR } else { BAR / 2 };
@@ -90,7 +90,7 @@ fn text_of(progress: &Progress, brevity: u32) -> String {
         };
     }
     if brevity < 7 {
-        text += &match pace {
+        text += &match rate {
             PlaybackRate::Times(rate) => format!("  x{rate}"),
             PlaybackRate::Max => "  x max".to_owned(),
         };
@@ -143,7 +143,7 @@ mod tests {
         let progress = Progress {
             position_ns: 65_250_000_000,
             length_ns: Some(130_500_000_000),
-            pace: PlaybackRate::Times(0.5),
+            rate: PlaybackRate::Times(0.5),
             is_paused: false,
             is_over: false,
             lap: 0,
@@ -154,7 +154,7 @@ mod tests {
         };
         let begin = "1:05.2 [##########..........] 2:10.5  x0.5  7 telegrams  ";
         assert_eq!(text(&progress, usize::MAX), format!("{begin}space pauses, + - rate, q quits"));
-        let open = Progress { length_ns: None, pace: PlaybackRate::Max, lap: 1, is_paused: true, ..progress };
+        let open = Progress { length_ns: None, rate: PlaybackRate::Max, lap: 1, is_paused: true, ..progress };
         assert_eq!(
             text(&open, 200),
             "1:05.2  x max  7 telegrams  lap 2  paused; space continues, . steps, q quits"
@@ -181,7 +181,7 @@ mod tests {
         let played = Progress {
             position_ns: 60_000_000_000,
             length_ns: None,
-            pace: PlaybackRate::Max,
+            rate: PlaybackRate::Max,
             is_paused: false,
             is_over: true,
             lap: 0,
@@ -192,7 +192,7 @@ mod tests {
         };
         let words = "replayed 7 telegrams up to 1:00.0, in 30 ms, 2000 times as fast as it was recorded";
         assert_eq!(summary(&played), words);
-        let slow = Progress { pace: PlaybackRate::Times(1.0), took_ns: 61_000_000_000, ..played };
+        let slow = Progress { rate: PlaybackRate::Times(1.0), took_ns: 61_000_000_000, ..played };
         assert_eq!(summary(&slow), "replayed 7 telegrams up to 1:00.0, in 61.0 s");
         let paused = Progress { paused_ns: 12_340_000_000, ..played };
         let words = "replayed 7 telegrams up to 1:00.0, in 30 ms and 12.3 s of pauses, 2000 times as fast as it was recorded";

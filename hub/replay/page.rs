@@ -79,7 +79,7 @@ impl Playback for Keys {
         Progress {
             position_s: seconds(progress.position_ns),
             length_s: progress.length_ns.map(seconds),
-            rate: match progress.pace {
+            rate: match progress.rate {
                 PlaybackRate::Times(rate) => Some(rate),
                 PlaybackRate::Max => None,
             },

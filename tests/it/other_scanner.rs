@@ -10,7 +10,7 @@ use scanhub_schema::{Family, MILLIS, Nanos, Status};
 use scanhub_shm::Payload;
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::machine::{self, LmsSimulator, Start};
 use scanhub_sim::operating::Operating;
 use scanhub_sim::room::Room;
@@ -198,7 +198,7 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     };
     let unit = RplidarSettings { start: RplidarStart::Streaming, seed: 7, ..RplidarSettings::of(Model::A1) };
     [
-        ("ld19", Box::new(LdSimulator::new(head, Packets::Room(Box::new(room()))))),
+        ("ld19", Box::new(LdSimulator::new(head, room()))),
         ("lms scanner", Box::new(LmsSimulator::new(machine, scanhub_sim::operating::Source::Room(room())))),
         ("a1", Box::new(RplidarSimulator::new(unit, room()))),
     ]

@@ -179,7 +179,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
         if let Some(saved_state) = self.platform.saved_state()
             && let Some((pose, model)) = self.output.take_background_to_save(is_last)
         {
-            saved_state.keep_background(pose, model);
+            saved_state.save_background(pose, model);
         }
     }
 
@@ -224,7 +224,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
                 Some(control) => self.control.control(control, &mut target, now).map(|()| None),
                 None => {
                     let shown = self.output.handle(request.verb, &request.model);
-                    let kept_wall_ns = self.platform.saved_state().and_then(SavedState::kept_wall_ns);
+                    let kept_wall_ns = self.platform.saved_state().and_then(SavedState::saved_wall_ns);
                     shown.map(|model| model.map(|model| Box::new(Shown { model, kept_wall_ns })))
                 }
             };

@@ -89,11 +89,11 @@ pub trait Platform {
 /// Saved state of a link, for the next hub. No function waits for a disk.
 pub trait SavedState {
     /// Saves the background of a sensor at `pose`.
-    fn keep_background(&self, pose: Pose, model: Box<Background>);
+    fn save_background(&self, pose: Pose, model: Box<Background>);
 
     /// Returns the time at which the background for the next hub was written, in ns since 1970; `None` if there is
     /// none.
-    fn kept_wall_ns(&self) -> Option<u64>;
+    fn saved_wall_ns(&self) -> Option<u64>;
 
     /// Returns the rate at which the last search found the scanner at `port`.
     fn rate(&self, port: &str) -> Option<KnownRate>;
@@ -102,10 +102,10 @@ pub trait SavedState {
     fn scanner(&self, port: &str) -> Option<KnownScanner>;
 
     /// Saves the `scanner` that a search found at `port`.
-    fn keep_scanner(&self, port: &str, scanner: KnownScanner);
+    fn save_scanner(&self, port: &str, scanner: KnownScanner);
 
     /// Saves the `rate` at which the scanner at `port` was found.
-    fn keep_rate(&self, port: &str, rate: KnownRate);
+    fn save_rate(&self, port: &str, rate: KnownRate);
 }
 
 /// Open line. No function waits.

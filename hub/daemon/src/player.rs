@@ -28,7 +28,7 @@ pub enum PlaybackRate {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PlaybackOptions {
     /// Speed of playback.
-    pub pace: PlaybackRate,
+    pub rate: PlaybackRate,
     /// Media time, in ns, before which nothing is published.
     pub start_ns: Nanos,
     /// Media time, in ns, at which playback ends.
@@ -82,7 +82,7 @@ pub struct Progress {
     /// Media time of the end, in ns, if it is known.
     pub length_ns: Option<u64>,
     /// Speed of playback.
-    pub pace: PlaybackRate,
+    pub rate: PlaybackRate,
     /// Whether it is paused.
     pub is_paused: bool,
     /// Whether everything was played.
@@ -213,14 +213,14 @@ impl Player {
     /// Doubles the rate.
     pub fn speed_up(&self) {
         self.change(|playback, now, position| {
-            playback.set_rate(playback.play().pace.doubled(), now, position);
+            playback.set_rate(playback.play().rate.doubled(), now, position);
         });
     }
 
     /// Halves the rate.
     pub fn slow_down(&self) {
         self.change(|playback, now, position| {
-            playback.set_rate(playback.play().pace.halved(), now, position);
+            playback.set_rate(playback.play().rate.halved(), now, position);
         });
     }
 
@@ -242,7 +242,7 @@ impl Player {
         Progress {
             position_ns: if is_over { position } else { media },
             length_ns,
-            pace: playback.play().pace,
+            rate: playback.play().rate,
             is_paused: playback.play().is_paused,
             is_over,
             lap: playback.lap(),
@@ -467,7 +467,7 @@ impl Playback {
         if self.play.is_paused {
             return if media < from { self.play_now(link, Due::at_once(now)) } else { PlaybackAction::Wait };
         }
-        let PlaybackRate::Times(rate) = self.play.pace else { return self.play_now(link, Due::at_once(now)) };
+        let PlaybackRate::Times(rate) = self.play.rate else { return self.play_now(link, Due::at_once(now)) };
         if self.skip_silence(now) {
             return self.next_action(link, media, now);
         }
@@ -486,7 +486,7 @@ impl Playback {
         }
         let at_once =
             |is_due| if is_due { PlaybackAction::Now(Due::at_once(now)) } else { PlaybackAction::Wait };
-        match (self.anchor, self.play.pace) {
+        match (self.anchor, self.play.rate) {
             (None, _) => PlaybackAction::Wait,
             (Some((_, from)), _) if self.play.is_paused => at_once(media < from),
             (_, PlaybackRate::Max) => at_once(media <= position),
@@ -539,9 +539,9 @@ impl Playback {
     }
 
     /// Continues at another rate.
-    fn set_rate(&mut self, pace: PlaybackRate, now: Nanos, position: Nanos) {
+    fn set_rate(&mut self, rate: PlaybackRate, now: Nanos, position: Nanos) {
         self.set_anchor(now, position);
-        self.play.pace = pace;
+        self.play.rate = rate;
     }
 
     fn play(&self) -> &PlaybackOptions {
@@ -554,7 +554,7 @@ impl Playback {
 
     /// Returns whether every telegram is due at once until something changes.
     fn is_unthrottled(&self) -> bool {
-        self.anchor.is_some() && !self.play.is_paused && self.play.pace == PlaybackRate::Max
+        self.anchor.is_some() && !self.play.is_paused && self.play.rate == PlaybackRate::Max
     }
 
     /// Returns whether everything was played.
@@ -590,7 +590,7 @@ impl Playback {
     /// Returns the media time at `now`: `position` at maximum rate.
     fn media(&self, now: Nanos, position: Nanos) -> Nanos {
         let Some((since, from)) = self.anchor else { return self.play.start_ns };
-        match self.play.pace {
+        match self.play.rate {
             _ if self.play.is_paused => from,
             PlaybackRate::Max => position.max(from),
             PlaybackRate::Times(rate) => {
@@ -727,7 +727,7 @@ mod tests {
     #[test]
     fn rate_changes_at_the_current_media_time() {
         let mut playback =
-            begun(1, PlaybackOptions { pace: PlaybackRate::Times(2.0), ..PlaybackOptions::default() });
+            begun(1, PlaybackOptions { rate: PlaybackRate::Times(2.0), ..PlaybackOptions::default() });
         assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
         assert_eq!(playback.next_action(0, 8 * SECOND, 101 * SECOND), PlaybackAction::At(104 * SECOND));
         playback.set_rate(PlaybackRate::Times(0.5), 102 * SECOND, 0);
@@ -770,7 +770,7 @@ mod tests {
     #[test]
     fn pauses_are_not_playing_time() {
         let mut playback = Playback::new(
-            PlaybackOptions { pace: PlaybackRate::Max, is_paused: true, ..PlaybackOptions::default() },
+            PlaybackOptions { rate: PlaybackRate::Max, is_paused: true, ..PlaybackOptions::default() },
             1,
         );
         assert_eq!(playback.next_action(0, 0, 90 * SECOND), PlaybackAction::Wait);

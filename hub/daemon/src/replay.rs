@@ -55,11 +55,11 @@ pub(crate) fn run<'a>(
         replay.play(recorded);
         return replay.link.end();
     }
-    let pace = if paced { PlaybackRate::default() } else { PlaybackRate::Max };
+    let rate = if paced { PlaybackRate::default() } else { PlaybackRate::Max };
     let alone = || {
         let recorded = Recorded::open(path, link.link)?;
         let player =
-            Player::new(PlaybackOptions { pace, ..PlaybackOptions::default() }, 1, recorded.length())?;
+            Player::new(PlaybackOptions { rate, ..PlaybackOptions::default() }, 1, recorded.length())?;
         Ok((recorded, player))
     };
     match alone() {

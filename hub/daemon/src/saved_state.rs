@@ -188,12 +188,12 @@ impl SaveQueue {
 }
 
 impl SavedState for SaveSlot<'_> {
-    fn keep_background(&self, pose: Pose, model: Box<Background>) {
+    fn save_background(&self, pose: Pose, model: Box<Background>) {
         *lock(&self.slot.background) = Some((pose, model));
         self.queue.event.signal();
     }
 
-    fn kept_wall_ns(&self) -> Option<u64> {
+    fn saved_wall_ns(&self) -> Option<u64> {
         Some(self.slot.saved_wall_ns.load(Ordering::Relaxed)).filter(|&wall_ns| wall_ns != 0)
     }
 
@@ -205,13 +205,13 @@ impl SavedState for SaveSlot<'_> {
         self.slot.scanner.of(port)
     }
 
-    fn keep_scanner(&self, port: &str, scanner: KnownScanner) {
+    fn save_scanner(&self, port: &str, scanner: KnownScanner) {
         if self.slot.scanner.replace(port, scanner) {
             self.queue.event.signal();
         }
     }
 
-    fn keep_rate(&self, port: &str, rate: KnownRate) {
+    fn save_rate(&self, port: &str, rate: KnownRate) {
         if self.slot.rate.replace(port, rate) {
             self.queue.event.signal();
         }
@@ -587,7 +587,7 @@ mod tests {
         for (baud, silent_switches) in [(9_600, 0), (38_400, 2), (500_000, 0)] {
             let rate = KnownRate { baud, silent_switches };
             let mut saver = saver(&format!("front={PORT}"), &state);
-            saver.queue().slot("front").expect("a slot").keep_rate(PORT, rate);
+            saver.queue().slot("front").expect("a slot").save_rate(PORT, rate);
             assert_eq!(saver.flush_due(1, 1, true), Nanos::MAX);
             assert_eq!(known("front", PORT), Some(rate));
             assert_eq!((known("rear", PORT), known("front", "/dev/ttyUSB0")), (None, None));
@@ -604,7 +604,7 @@ mod tests {
         let memory = Memory { family: Family::Ld, stream_rate: 921_600, reply_rate: 921_600 };
         let scanner = KnownScanner { memory, model: Some("stl27l".to_owned()), beams: Some(2_160) };
         let mut first = saver("front=/dev/x,family=auto", &state);
-        first.queue().slot("front").expect("a slot").keep_scanner("/dev/x", scanner.clone());
+        first.queue().slot("front").expect("a slot").save_scanner("/dev/x", scanner.clone());
         first.flush_due(1, 1, true);
         for (link, port, expected) in [
             ("front=/dev/x,family=auto", "/dev/x", Some(&scanner)),

@@ -330,7 +330,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         let (state, has_changed) = core.diagnosis.update(session, now);
         if has_changed && let Some(rate) = session.known_rate() {
             self.found_rate = Some(rate);
-            saved_rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), rate));
+            saved_rates(core).iter().for_each(|rates| rates.save_rate(&core.link.port.name(), rate));
         }
         if (has_changed || core.is_due(now)) && core.show_session(session, state) {
             self.identity.save(session, platform.now());
@@ -422,7 +422,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         }
         if self.scanner.as_ref() != Some(&scanner) {
             if let Some(saved_state) = core.platform.saved_state() {
-                saved_state.keep_scanner(&link.port.name(), scanner.clone());
+                saved_state.save_scanner(&link.port.name(), scanner.clone());
             }
             self.scanner = Some(scanner);
         }

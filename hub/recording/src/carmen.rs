@@ -352,8 +352,9 @@ pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Fail
         }
     }
     contents.unread = log.unread;
-    let (encoding, unfit) = stats.encoding(log.told);
-    (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
+    let (encoding, unencodable) = stats.encoding(log.told);
+    (contents.unit, contents.mode, contents.unencodable) =
+        (Some(encoding.unit), Some(encoding.mode), unencodable);
     // If no line is right, the format is wrong, not the file.
     match refusal.filter(|_| contents.scans == 0) {
         Some(refusal) => Err(refusal),
@@ -380,7 +381,7 @@ pub(crate) struct RangeStats {
 
 /// Ranges of a log that no LMS 2xx could have sent together.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Unfit {
+pub struct UnencodableRanges {
     /// Ranges that are rounded.
     pub rounded: u64,
     /// Ranges that are too far for any value.
@@ -406,7 +407,7 @@ impl RangeStats {
     /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log names itself
     /// (`told`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or millimeters, with
     /// as few bits as the longest range needs.
-    pub(crate) fn encoding(&self, told: Option<Encoding>) -> (Encoding, Unfit) {
+    pub(crate) fn encoding(&self, told: Option<Encoding>) -> (Encoding, UnencodableRanges) {
         let order = if self.finer[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
         let of_unit = |unit: Unit| MODES.map(|mode| Encoding { unit, mode });
         let all = told.into_iter().chain(order.into_iter().flat_map(of_unit));
@@ -414,7 +415,7 @@ impl RangeStats {
         let encoding = all.clone().find(fits).or_else(|| all.clone().find(|it| self.reaches(*it)));
         let encoding = encoding.unwrap_or(COARSEST);
         let rounded = self.finer[usize::from(encoding.unit == Unit::Mm)];
-        (encoding, Unfit { rounded, beyond: self.beyond })
+        (encoding, UnencodableRanges { rounded, beyond: self.beyond })
     }
 
     fn reaches(&self, encoding: Encoding) -> bool {
@@ -431,15 +432,15 @@ impl RangeStats {
     }
 }
 
-impl Unfit {
+impl UnencodableRanges {
     /// Returns whether all ranges fit.
     pub fn is_none(&self) -> bool {
-        *self == Unfit::default()
+        *self == UnencodableRanges::default()
     }
 }
 
 /// Lists the counts that are not 0.
-impl fmt::Display for Unfit {
+impl fmt::Display for UnencodableRanges {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let counted = |count: u64, what: &str| (count > 0).then(|| format!("{count} {what}"));
         let parts = [
@@ -637,16 +638,16 @@ mod tests {
         assert_eq!(has(&format!("RAWLASER1 {sensor} 181 {ranges} 1 9 12.25 host 1")), (false, true));
     }
 
-    fn chosen(ranges_m: &[f64], told: Option<Encoding>) -> (u8, u8, Unfit) {
+    fn chosen(ranges_m: &[f64], told: Option<Encoding>) -> (u8, u8, UnencodableRanges) {
         let mut stats = RangeStats::default();
         stats.note(ranges_m);
-        let (encoding, unfit) = stats.encoding(told);
-        (encoding.unit.mm(), encoding.mode.range_bits(), unfit)
+        let (encoding, unencodable) = stats.encoding(told);
+        (encoding.unit.mm(), encoding.mode.range_bits(), unencodable)
     }
 
     #[test]
     fn unit_and_bits_are_those_that_lose_nothing() {
-        let none = Unfit::default();
+        let none = UnencodableRanges::default();
         assert_eq!(chosen(&[], None), (10, 13, none));
         assert_eq!(chosen(&[20.0, 0.01, 81.91, f64::NAN, -1.0], None), (10, 13, none));
         assert_eq!(chosen(&[81.92], None), (10, 14, none));
@@ -659,25 +660,28 @@ mod tests {
 
     #[test]
     fn what_no_sensor_sends_is_counted() {
-        assert_eq!(chosen(&[1.234, 2.0, 81.91], None), (10, 13, Unfit { rounded: 1, beyond: 0 }));
-        assert_eq!(chosen(&[1.23456, 9.0, 9.001], None), (1, 14, Unfit { rounded: 1, beyond: 0 }));
-        assert_eq!(chosen(&[1.5, 1e30, 1000.0], None), (10, 13, Unfit { rounded: 0, beyond: 2 }));
-        let unfit = Unfit { rounded: 2, beyond: 1 };
+        assert_eq!(chosen(&[1.234, 2.0, 81.91], None), (10, 13, UnencodableRanges { rounded: 1, beyond: 0 }));
+        assert_eq!(
+            chosen(&[1.23456, 9.0, 9.001], None),
+            (1, 14, UnencodableRanges { rounded: 1, beyond: 0 })
+        );
+        assert_eq!(chosen(&[1.5, 1e30, 1000.0], None), (10, 13, UnencodableRanges { rounded: 0, beyond: 2 }));
+        let unencodable = UnencodableRanges { rounded: 2, beyond: 1 };
         assert!(
-            unfit.to_string().contains("2 ranges are finer")
-                && unfit.to_string().contains("1 ranges are too long")
+            unencodable.to_string().contains("2 ranges are finer")
+                && unencodable.to_string().contains("1 ranges are too long")
         );
     }
 
     #[test]
     fn what_the_log_says_itself_holds_if_it_can() {
         let mm = |mode| Some(Encoding { unit: Unit::Mm, mode: Mode(mode) });
-        assert_eq!(chosen(&[8.185], mm(0x04)), (1, 14, Unfit::default()));
-        assert_eq!(chosen(&[8.185], None), (1, 13, Unfit::default()));
-        assert_eq!(chosen(&[20.0], mm(0x04)), (10, 13, Unfit::default()));
+        assert_eq!(chosen(&[8.185], mm(0x04)), (1, 14, UnencodableRanges::default()));
+        assert_eq!(chosen(&[8.185], None), (1, 13, UnencodableRanges::default()));
+        assert_eq!(chosen(&[20.0], mm(0x04)), (10, 13, UnencodableRanges::default()));
         assert_eq!(
             chosen(&[1.234], Some(Encoding { unit: Unit::Cm, mode: Mode(0) })),
-            (1, 13, Unfit::default())
+            (1, 13, UnencodableRanges::default())
         );
     }
 

@@ -282,9 +282,10 @@ impl Written {
 /// measuring mode is unknown.
 fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> {
     let contents = recording.contents();
-    let unfit = contents.unfit;
-    if !unfit.is_none() {
-        let message = format!("{} cannot become telegrams without loss: {unfit}", recording.path().display());
+    let unencodable = contents.unencodable;
+    if !unencodable.is_none() {
+        let message =
+            format!("{} cannot become telegrams without loss: {unencodable}", recording.path().display());
         let hint = "round its ranges first; `scanhub replay` plays it rounded";
         return Err(Failure::new(Kind::Input, message, hint));
     }

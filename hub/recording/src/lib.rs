@@ -21,7 +21,7 @@ use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use scanhub_schema::{Family, Nanos};
 
-pub use carmen::{BEYOND, Unfit, Unread};
+pub use carmen::{BEYOND, UnencodableRanges, Unread};
 pub use open::Recording;
 pub use stream::VirtualTime;
 
@@ -142,7 +142,7 @@ pub struct Contents {
     /// Bits that are set in any value of the scans; none for a log.
     pub bits: u16,
     /// Ranges of a log that its unit and mode cannot encode.
-    pub unfit: Unfit,
+    pub unencodable: UnencodableRanges,
     /// Data of a log that its scans do not contain.
     pub unread: Unread,
     /// Data that could not be read. [`telegrams`](Recording::telegrams) returns the rest.

@@ -8,7 +8,7 @@ use scanhub_drivers::{Settings, ld, rplidar};
 use scanhub_schema::{MILLIS, Nanos, line_time};
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::port::now_ns;
 
 use scanhub_sim::room::Room;
@@ -106,7 +106,7 @@ fn main() {
     println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
     for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
         let session = ld::Session::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
-        let head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
+        let head = LdSimulator::new(LdSettings::of(model), room());
         let a_turn = model.points_per_second() / model.turns_per_second();
         let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
         rows(model.name(), a_turn as usize, &turns(session, head, 30).0, &percents);

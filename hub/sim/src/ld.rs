@@ -55,19 +55,6 @@ impl LdSettings {
     }
 }
 
-/// Source of the packets that a scanner sends.
-pub enum Packets {
-    /// The scanner measures a room.
-    Room(Box<Room>),
-    /// The scanner repeats recorded packets, once or in a loop.
-    Recorded {
-        /// The packets.
-        packets: Vec<[u8; LEN]>,
-        /// Whether they restart at their end.
-        looped: bool,
-    },
-}
-
 /// A simulated scanner of LDROBOT.
 pub struct LdSimulator {
     settings: LdSettings,
@@ -82,10 +69,14 @@ pub struct LdSimulator {
     tx_queue: TxQueue,
 }
 
+/// Source of the packets that a scanner sends.
 enum Source {
+    /// The scanner measures a room.
     Room(Beams),
+    /// The scanner repeats recorded packets.
     Recorded {
         packets: Vec<[u8; LEN]>,
+        /// Whether they restart at their end.
         looped: bool,
         /// Time since the first packet by the clock of the recorded scanner, in milliseconds.
         passed_ms: u64,
@@ -93,12 +84,17 @@ enum Source {
 }
 
 impl LdSimulator {
-    /// Creates the scanner that `settings` describe, at time 0. Its head rotates already.
-    pub fn new(settings: LdSettings, packets: Packets) -> LdSimulator {
-        let source = match packets {
-            Packets::Room(room) => Source::Room(Beams::new(*room)),
-            Packets::Recorded { packets, looped } => Source::Recorded { packets, looped, passed_ms: 0 },
-        };
+    /// Creates the scanner that `settings` describe in `room`, at time 0. Its head rotates already.
+    pub fn new(settings: LdSettings, room: Room) -> LdSimulator {
+        LdSimulator::of(settings, Source::Room(Beams::new(room)))
+    }
+
+    /// Creates a scanner that repeats recorded `packets` instead of measuring, once or in a loop.
+    pub fn repeating(settings: LdSettings, packets: Vec<[u8; LEN]>, looped: bool) -> LdSimulator {
+        LdSimulator::of(settings, Source::Recorded { packets, looped, passed_ms: 0 })
+    }
+
+    fn of(settings: LdSettings, source: Source) -> LdSimulator {
         let LdSettings { turns_per_second, wander, seed, .. } = settings;
         let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
         let tx_queue = TxQueue::new(settings.model.baud(), settings.chunk);

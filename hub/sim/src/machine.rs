@@ -171,8 +171,8 @@ enum Tag {
 }
 
 /// A reply to a request.
-struct Answer {
-    reply: Vec<u8>,
+struct Reply {
+    telegram: Vec<u8>,
     /// Minimum time from the ACK to the reply.
     delay_ns: Nanos,
     after: After,
@@ -328,7 +328,7 @@ impl LmsSimulator {
     }
 
     /// Carries out `request` at `now`, and returns the reply.
-    fn answer(&mut self, request: Telegram<'_>, now: Nanos) -> Answer {
+    fn answer(&mut self, request: Telegram<'_>, now: Nanos) -> Reply {
         if EEPROM_WRITES.contains(&request.command()) {
             self.eeprom.writes += 1;
         }
@@ -356,7 +356,7 @@ impl LmsSimulator {
             Some(Request::Reset) => {
                 self.settings.errors.clear();
                 let announced = self.reply(reply::RESET, &[]);
-                Answer { after: After::Reset, ..answer(&announced, self.thinking_ns()) }
+                Reply { after: After::Reset, ..answer(&announced, self.thinking_ns()) }
             }
             Some(Request::Variant(variant)) => {
                 let done = self.source.variant().is_none_or(|fixed| fixed == variant) && self.can(variant);
@@ -367,7 +367,7 @@ impl LmsSimulator {
             }
             Some(Request::Baud(baud)) => {
                 let changed = reply::mode(address, true, status);
-                Answer { after: After::Baud(baud), ..answer(&changed, self.mode_ns()) }
+                Reply { after: After::Baud(baud), ..answer(&changed, self.mode_ns()) }
             }
             Some(Request::Operate(Asked::Installation(password))) => match password {
                 Password::FACTORY => self.change_mode(Operating::Installation),
@@ -393,7 +393,7 @@ impl LmsSimulator {
     }
 
     /// Carries out a request that writes the EEPROM, or that [`Request`] does not decode.
-    fn answer_other(&mut self, request: Telegram<'_>) -> Answer {
+    fn answer_other(&mut self, request: Telegram<'_>) -> Reply {
         let (address, status) = (self.settings.address, self.settings.status);
         let is_installation = self.operating == Operating::Installation;
         match Write::decode(request) {
@@ -416,21 +416,21 @@ impl LmsSimulator {
         }
     }
 
-    fn counters(&mut self) -> Answer {
+    fn counters(&mut self) -> Reply {
         answer(&self.reply(command::COUNTERS | REPLY, &COUNTED), self.thinking_ns())
     }
 
-    fn measure_once(&mut self, operating: &Operating, now: Nanos) -> Answer {
+    fn measure_once(&mut self, operating: &Operating, now: Nanos) -> Reply {
         let delay_ns = operating.turns(self.variant) * MIRROR_TURN;
         let single =
             self.source.variant().is_none().then(|| self.measure(operating, now + delay_ns)).flatten();
         match single {
-            Some(reply) => Answer { reply, delay_ns, after: After::Nothing },
+            Some(telegram) => Reply { telegram, delay_ns, after: After::Nothing },
             None => self.refusal(),
         }
     }
 
-    fn change_mode(&mut self, operating: Operating) -> Answer {
+    fn change_mode(&mut self, operating: Operating) -> Reply {
         self.operating = operating;
         self.partials = 0;
         answer(&reply::mode(self.settings.address, true, self.settings.status), self.mode_ns())
@@ -438,7 +438,7 @@ impl LmsSimulator {
 
     /// Writes the configuration (77h in installation mode), as many bytes as `data` has. Unit and mode of a recording
     /// cannot change.
-    fn write_configuration(&mut self, data: &[u8]) -> Answer {
+    fn write_configuration(&mut self, data: &[u8]) -> Reply {
         let (unit, mode) = (self.eeprom.unit(), self.eeprom.mode());
         let written = self.eeprom.rewritten(data).filter(|written| {
             self.source.variant().is_none() || (written.unit() == unit && written.mode() == mode)
@@ -511,7 +511,7 @@ impl LmsSimulator {
         self.family().and_then(|family| family.refuses_variant(variant)).is_none()
     }
 
-    fn refusal(&mut self) -> Answer {
+    fn refusal(&mut self) -> Reply {
         answer(&reply::refused(self.settings.address, self.settings.status), self.thinking_ns())
     }
 
@@ -560,7 +560,7 @@ impl Device for LmsSimulator {
             self.send(vec![NAK], first_ns, Tag::Acknowledge);
             return;
         };
-        let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
+        let Reply { telegram: reply, delay_ns, after } = self.answer(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
         let late_ns = self.settings.quirks.late_reply_ns;
         let reply_ns = acknowledged_ns + delay_ns + late_ns;
@@ -616,8 +616,8 @@ impl Device for LmsSimulator {
     }
 }
 
-fn answer(reply: &Encoded, delay_ns: Nanos) -> Answer {
-    Answer { reply: reply.bytes().to_vec(), delay_ns, after: After::Nothing }
+fn answer(reply: &Encoded, delay_ns: Nanos) -> Reply {
+    Reply { telegram: reply.bytes().to_vec(), delay_ns, after: After::Nothing }
 }
 
 /// The part of the EEPROM that the simulation uses. It outlives a power cycle.

@@ -19,7 +19,7 @@ pub(crate) struct Rotation {
     /// Time constant of the spin-up, in seconds; 0 means full speed at once.
     pub(crate) spin_up_s: f64,
     /// Angular frequency of the variation of the speed, in radians per second.
-    pace: f64,
+    angular_frequency: f64,
     /// Phase of the variation at the start, in radians.
     phase: f64,
     /// Time in seconds at which the mean speed was set, and the number of revolutions until then.
@@ -48,7 +48,7 @@ impl Rotation {
             turns_per_second,
             wander,
             spin_up_s,
-            pace: TAU / WANDER_S,
+            angular_frequency: TAU / WANDER_S,
             phase,
             since: (0.0, phase / TAU),
         }
@@ -63,15 +63,15 @@ impl Rotation {
     /// Returns the number of revolutions until `seconds`, counted from the head's zero.
     pub(crate) fn turns(&self, seconds: f64) -> f64 {
         let (since, turned) = self.since;
-        let angle = |seconds: f64| (self.pace * seconds + self.phase).sin();
-        let swing = (angle(seconds) - angle(since)) / self.pace;
+        let angle = |seconds: f64| (self.angular_frequency * seconds + self.phase).sin();
+        let swing = (angle(seconds) - angle(since)) / self.angular_frequency;
         let missed = self.spin_up_s * (self.still(since) - self.still(seconds));
         self.turns_per_second * (seconds - since - missed + self.wander * swing) + turned
     }
 
     /// Returns the revolutions per second at `seconds`.
     pub(crate) fn speed(&self, seconds: f64) -> f64 {
-        let wander = self.wander * (self.pace * seconds + self.phase).cos();
+        let wander = self.wander * (self.angular_frequency * seconds + self.phase).cos();
         self.turns_per_second * (1.0 - self.still(seconds) + wander)
     }
 

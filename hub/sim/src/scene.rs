@@ -14,7 +14,7 @@ pub struct Scene {
     /// The sensors in the scene.
     pub(crate) sensors: Vec<Sensor>,
     pub(crate) noise: NoiseModel,
-    pub(crate) things: Vec<Thing>,
+    pub(crate) objects: Vec<Object>,
     pub(crate) people: Vec<Plan>,
     pub(crate) suns: Vec<Sun>,
 }
@@ -42,7 +42,7 @@ pub(crate) enum Surface {
 
 /// A wall, a piece of furniture, a box, a door.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Thing {
+pub(crate) struct Object {
     /// Outline in the object's own frame.
     pub(crate) shapes: Vec<Shape>,
     /// Heights, for tilted sensors.
@@ -87,7 +87,7 @@ pub(crate) struct Presence {
     pub(crate) since_s: f64,
 }
 
-impl Thing {
+impl Object {
     /// Returns whether the object never changes.
     pub(crate) fn is_still(&self) -> bool {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
@@ -461,11 +461,11 @@ mod tests {
 
     const HERE: Pose = Pose { x_mm: 100.0, y_mm: 200.0, turn_deg: 0.0 };
 
-    fn thing(from_s: f64, until_s: f64, moves: &[Move]) -> Thing {
+    fn object(from_s: f64, until_s: f64, moves: &[Move]) -> Object {
         let shapes = vec![Shape::Post { centre: (0.0, 0.0), radius: 10.0 }];
         let moves = moves.to_vec();
         let (heights, is_box) = (Heights::ALL, false);
-        Thing {
+        Object {
             shapes,
             heights,
             is_box,
@@ -481,23 +481,23 @@ mod tests {
 
     #[test]
     fn box_appears_and_disappears() {
-        let thing = thing(15.0, 20.0, &[]);
-        assert!(thing.at(14.9).is_none() && thing.left(14.9).is_empty() && !thing.is_still());
-        assert_eq!(thing.at(16.0).map(|presence| presence.since_s), Some(15.0));
-        assert!(thing.at(20.0).is_none());
-        assert_eq!(thing.left(30.0).iter().map(|presence| presence.since_s).collect::<Vec<_>>(), [20.0]);
+        let object = object(15.0, 20.0, &[]);
+        assert!(object.at(14.9).is_none() && object.left(14.9).is_empty() && !object.is_still());
+        assert_eq!(object.at(16.0).map(|presence| presence.since_s), Some(15.0));
+        assert!(object.at(20.0).is_none());
+        assert_eq!(object.left(30.0).iter().map(|presence| presence.since_s).collect::<Vec<_>>(), [20.0]);
     }
 
     #[test]
     fn door_rotates_and_leaves_its_pose() {
         let by = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
-        let thing = thing(0.0, f64::INFINITY, &[Move { from_s: 10.0, until_s: 12.0, by }]);
-        let state = |time_s| thing.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
+        let object = object(0.0, f64::INFINITY, &[Move { from_s: 10.0, until_s: 12.0, by }]);
+        let state = |time_s| object.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
         assert_eq!(state(9.0), Some((0.0, 0.0)));
         assert_eq!(state(11.0), Some((45.0, 11.0)));
         assert_eq!(state(20.0), Some((90.0, 12.0)));
-        assert!(thing.left(9.0).is_empty());
-        assert_eq!(thing.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
+        assert!(object.left(9.0).is_empty());
+        assert_eq!(object.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
     }
 
     #[test]
@@ -505,7 +505,7 @@ mod tests {
         let by = |turn_deg| Pose { x_mm: 0.0, y_mm: 0.0, turn_deg };
         let opens = Move { from_s: 10.0, until_s: 12.0, by: by(90.0) };
         let closes = Move { from_s: 15.0, until_s: 16.0, by: by(-90.0) };
-        let door = Thing { repeat_s: Some(20.0), ..thing(0.0, f64::INFINITY, &[opens, closes]) };
+        let door = Object { repeat_s: Some(20.0), ..object(0.0, f64::INFINITY, &[opens, closes]) };
         let state = |time_s| door.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
         assert_eq!((state(9.0), state(29.0)), (Some((0.0, 0.0)), Some((0.0, 16.0))));
         for round_s in [0.0, 20.0, 2_000.0] {
@@ -657,7 +657,8 @@ mod tests {
             let mut random = fastrand::Rng::with_seed(1);
             let people: Vec<Person> =
                 scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
-            let leaves: Vec<&Thing> = scene.things.iter().filter(|thing| thing.repeat_s.is_some()).collect();
+            let leaves: Vec<&Object> =
+                scene.objects.iter().filter(|object| object.repeat_s.is_some()).collect();
             assert_eq!(leaves.len(), 1, "{name}");
             let mut nearest = f64::INFINITY;
             for time_s in (0..10_000).map(|tick| f64::from(tick) / 20.0) {

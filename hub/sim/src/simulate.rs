@@ -20,7 +20,7 @@ use sha2::{Digest, Sha256};
 
 use crate::device::{Device, Part};
 use crate::fault::{Fault, Faults};
-use crate::ld::{LdSettings, LdSimulator, Packets, recorded};
+use crate::ld::{LdSettings, LdSimulator, recorded};
 use crate::machine::{LmsSimulator, Settings, Start};
 use crate::mount::{Encoder, Report};
 use crate::operating::Source;
@@ -165,11 +165,11 @@ fn device(
             Box::new(LmsSimulator::new(settings, source))
         }
         Some(Scanner::Ld(model)) => {
-            let packets = match &options.replay {
-                Some(path) => Packets::Recorded { packets: recorded(path, sensor)?, looped: options.looped },
-                None => Packets::Room(Box::new(room())),
-            };
-            Box::new(LdSimulator::new(LdSettings { chunk, boot_ns, seed, ..LdSettings::of(model) }, packets))
+            let settings = LdSettings { chunk, boot_ns, seed, ..LdSettings::of(model) };
+            Box::new(match &options.replay {
+                Some(path) => LdSimulator::repeating(settings, recorded(path, sensor)?, options.looped),
+                None => LdSimulator::new(settings, room()),
+            })
         }
         Some(Scanner::Rplidar { model, mode }) => {
             let faults = options.faults;

@@ -9,7 +9,7 @@ use scanhub_schema::Nanos;
 use crate::beam::NoiseModel;
 use crate::mount::Mount;
 use crate::room::Mark;
-use crate::scene::{Person, Scene, Sun, Surface, Thing, jittered};
+use crate::scene::{Object, Person, Scene, Sun, Surface, jittered};
 use crate::shape::{Plane, Point, Pose, Shape};
 
 /// A scene with its random parts, seen by one scanner.
@@ -23,9 +23,9 @@ pub(crate) struct WorldView {
     /// View of all objects that never change; empty for a tilted scanner.
     still: View,
     /// The objects that never change; empty unless the scanner is tilted.
-    still_things: Vec<Thing>,
+    still_objects: Vec<Object>,
     still_reflectors: Vec<Shape>,
-    changing: Vec<Thing>,
+    changing: Vec<Object>,
     people: Vec<Person>,
     pub(crate) suns: Vec<Sun>,
 }
@@ -35,12 +35,12 @@ impl WorldView {
     pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> WorldView {
         let mut random = fastrand::Rng::with_seed(seed);
         let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
-        let mut things = scene.things.clone();
-        for thing in &mut things {
-            let place = (thing.pose.x_mm, thing.pose.y_mm);
-            (thing.pose.x_mm, thing.pose.y_mm) = jittered(place, thing.jitter_mm, &mut random);
+        let mut objects = scene.objects.clone();
+        for object in &mut objects {
+            let place = (object.pose.x_mm, object.pose.y_mm);
+            (object.pose.x_mm, object.pose.y_mm) = jittered(place, object.jitter_mm, &mut random);
         }
-        let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
+        let (still_objects, changing): (Vec<_>, Vec<_>) = objects.into_iter().partition(Object::is_still);
         let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
         let mut world = WorldView {
             noise: scene.noise,
@@ -48,31 +48,31 @@ impl WorldView {
             mount: scene.sensors[sensor as usize].mount.clone(),
             bias_mm: scene.noise.bias_mm * (2.0 * bias - 1.0),
             still: View::empty(),
-            still_things: Vec::new(),
+            still_objects: Vec::new(),
             still_reflectors: Vec::new(),
             changing,
             people,
             suns: scene.suns.clone(),
         };
         if world.mount.is_some() {
-            world.still_things = still_things;
+            world.still_objects = still_objects;
             return world;
         }
-        for thing in still_things {
-            for shape in world.seen(&thing, thing.pose) {
-                if thing.surface == Surface::Reflector {
+        for object in still_objects {
+            for shape in world.seen(&object, object.pose) {
+                if object.surface == Surface::Reflector {
                     world.still_reflectors.push(shape);
                 }
-                world.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
+                world.still.draw(Face { shape, surface: object.surface, kind: Kind::Static });
             }
         }
         world
     }
 
-    /// Returns the shapes of `thing` at `pose`, in the frame of the scanner.
-    fn seen(&self, thing: &Thing, pose: Pose) -> Vec<Shape> {
+    /// Returns the shapes of `object` at `pose`, in the frame of the scanner.
+    fn seen(&self, object: &Object, pose: Pose) -> Vec<Shape> {
         let place = |point| self.eye(pose.outward(point));
-        thing.shapes.iter().map(|shape| shape.placed(place)).collect()
+        object.shapes.iter().map(|shape| shape.placed(place)).collect()
     }
 
     /// Transforms a point of the world to the frame of the scanner: x to its right, y ahead.
@@ -85,11 +85,11 @@ impl WorldView {
     fn faces(&self, time_ns: Nanos) -> Vec<Face> {
         let time_s = time_ns as f64 / 1e9;
         let mut faces = Vec::new();
-        for thing in &self.changing {
-            let Some(presence) = thing.at(time_s) else { continue };
+        for object in &self.changing {
+            let Some(presence) = object.at(time_s) else { continue };
             let kind = Kind::since(nanos(presence.since_s));
-            let shapes = self.seen(thing, presence.pose);
-            faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
+            let shapes = self.seen(object, presence.pose);
+            faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: object.surface, kind }));
         }
         for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
             let leg = |leg: Shape| Face {
@@ -143,9 +143,9 @@ impl WorldView {
         for face in self.faces(time_ns) {
             view.draw(face);
         }
-        for thing in &self.changing {
-            for presence in thing.left(time_ns as f64 / 1e9) {
-                for shape in self.seen(thing, presence.pose) {
+        for object in &self.changing {
+            for presence in object.left(time_ns as f64 / 1e9) {
+                for shape in self.seen(object, presence.pose) {
                     view.uncover(&shape, nanos(presence.since_s));
                 }
             }
@@ -159,21 +159,23 @@ impl WorldView {
         if let Some(floor) = plane.cut_floor() {
             view.draw(face(floor, Surface::Plain, Kind::Static));
         }
-        for thing in self.still_things.iter().chain(&self.changing) {
-            let Some(presence) = thing.at(time_s) else { continue };
+        for object in self.still_objects.iter().chain(&self.changing) {
+            let Some(presence) = object.at(time_s) else { continue };
             let kind = Kind::since(nanos(presence.since_s));
-            let shapes = self.seen(thing, presence.pose);
-            plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.draw(face(cut, thing.surface, kind)));
+            let shapes = self.seen(object, presence.pose);
+            plane.cut(&shapes, object.heights, object.is_box, |cut| {
+                view.draw(face(cut, object.surface, kind))
+            });
         }
         for (part, heights) in self.people.iter().filter_map(|person| person.body(time_s)).flatten() {
             let part = part.placed(|point| self.eye(point));
             plane.cut(&[part], heights, false, |cut| view.draw(face(cut, Surface::Plain, Kind::Person)));
         }
-        for thing in &self.changing {
-            for presence in thing.left(time_s) {
-                let shapes = self.seen(thing, presence.pose);
+        for object in &self.changing {
+            for presence in object.left(time_s) {
+                let shapes = self.seen(object, presence.pose);
                 let since_ns = nanos(presence.since_s);
-                plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.uncover(&cut, since_ns));
+                plane.cut(&shapes, object.heights, object.is_box, |cut| view.uncover(&cut, since_ns));
             }
         }
     }

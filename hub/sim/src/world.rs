@@ -15,7 +15,7 @@ use toml::Spanned;
 
 use crate::beam::NoiseModel;
 use crate::mount::{Fault, FaultKind, Mount};
-use crate::scene::{Corner, Move, Plan, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, Thing, Way, length};
+use crate::scene::{Corner, Move, Object, Plan, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, Way, length};
 use crate::shape::{Heights, Point, Pose, Shape};
 
 /// The surroundings of the simulated scanners.
@@ -156,10 +156,10 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     Ok(Scene {
         sensors: if sensors.is_empty() { vec![Sensor { pose: MIDDLE, mount: None }] } else { sensors },
         noise: file.noise.model(&origin)?,
-        things: file
+        objects: file
             .thing
             .iter()
-            .map(|thing| thing.get_ref().thing(thing.span(), &origin))
+            .map(|object| object.get_ref().object(object.span(), &origin))
             .collect::<Result<_, _>>()?,
         people: file
             .person
@@ -289,7 +289,7 @@ impl NoiseFile {
 }
 
 impl ThingFile {
-    fn thing(&self, span: Range<usize>, origin: &Origin) -> Result<Thing, Failure> {
+    fn object(&self, span: Range<usize>, origin: &Origin) -> Result<Object, Failure> {
         let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
         let mut moves: Vec<Move> = Vec::new();
         for file in &self.moves {
@@ -306,7 +306,7 @@ impl ThingFile {
             }
             moves.push(Move { from_s: start_s, until_s: end_s, by: pose(origin, &file.by)? });
         }
-        Ok(Thing {
+        Ok(Object {
             shapes: self.shapes(span, origin)?,
             heights: self.heights(origin)?,
             is_box: self.sides.is_some(),

@@ -391,8 +391,8 @@ fn log_encoding(recording: &Recording, name: &str) {
     let contents = recording.contents();
     let Some(encoding) = recording.encoding().filter(|_| contents.form == Form::Carmen) else { return };
     tracing::info!("{name}: a CARMEN log, read as {encoding}");
-    if !contents.unfit.is_none() {
-        tracing::warn!("{name}: {}", contents.unfit);
+    if !contents.unencodable.is_none() {
+        tracing::warn!("{name}: {}", contents.unencodable);
     }
 }
 

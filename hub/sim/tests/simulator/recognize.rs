@@ -6,7 +6,7 @@ use scanhub_drivers::recognize::{EXAMINED, family_of};
 use scanhub_schema::{Family, MILLIS, Nanos};
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::machine::{LmsSimulator, Settings, Start};
 use scanhub_sim::operating::Operating;
 use scanhub_sim::operating::Source;
@@ -46,7 +46,7 @@ fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
         }
     }
     for model in scanhub_drivers::ld::Model::ALL {
-        let head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
+        let head = LdSimulator::new(LdSettings::of(model), room());
         scanners.push((Family::Ld, model.name().to_owned(), Box::new(head)));
     }
     for model in rplidar::Model::ALL {

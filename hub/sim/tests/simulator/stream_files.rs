@@ -15,7 +15,7 @@ use scanhub_schema::{Failure, Family, Foreground, Header, MILLIS, Nanos, Scan, S
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::room::Room;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 use scanhub_sim::wire::LineModel;
@@ -250,7 +250,7 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
 fn every_ldrobot_has_the_same_scans() {
     for model in ld::Model::ALL {
         for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
-            let mut head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
+            let mut head = LdSimulator::new(LdSettings::of(model), room());
             let live = Live::of(&mut head, Family::Ld, &settings);
             check_stream_files(model.name(), &live);
         }

@@ -8,7 +8,7 @@ use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
 use scanhub_schema::{MILLIS, Nanos, Scan};
 use scanhub_sim::ChunkSize;
 use scanhub_sim::device::Device;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets, TruePoint};
+use scanhub_sim::ld::{LdSettings, LdSimulator, TruePoint};
 use scanhub_sim::room::Changes;
 use scanhub_sim::room::Room;
 
@@ -125,7 +125,7 @@ struct AtLine {
 impl AtLine {
     fn new(settings: LdSettings, changes: Changes) -> AtLine {
         let room = Room::of_series(still_rooms(), changes.clone());
-        let head = LdSimulator::new(settings, Packets::Room(Box::new(room)));
+        let head = LdSimulator::new(settings, room);
         AtLine { head, settings, changes, told: 0, pace: 1.0, wanted: 1.0 }
     }
 }

@@ -11,7 +11,7 @@ use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::beam::NoiseModel;
 use scanhub_sim::device::{Device as _, Part};
 use scanhub_sim::fault::Faults;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::room::Room;
 use scanhub_sim::wire::LineModel;
 use scanhub_sim::world::World;
@@ -52,17 +52,15 @@ pub(crate) fn still(world: &str) -> World {
 
 impl Bench {
     pub(crate) fn new(settings: LdSettings, world: &World, faults: &str, seed: u64) -> Bench {
-        let room = Room::new(world, seed);
-        let packets = Packets::Room(Box::new(room));
-        Bench::of(settings, packets, faults, seed)
+        Bench::of(settings, LdSimulator::new(settings, Room::new(world, seed)), faults, seed)
     }
 
-    pub(crate) fn of(settings: LdSettings, packets: Packets, faults: &str, seed: u64) -> Bench {
+    pub(crate) fn of(settings: LdSettings, head: LdSimulator, faults: &str, seed: u64) -> Bench {
         let faults: Faults = faults.parse().expect("faults");
         let session = Session::new(Settings { model: Some(settings.model.name()), ..Settings::default() }, 0);
         Bench {
             session,
-            head: LdSimulator::new(settings, packets),
+            head,
             settings,
             wire: LineModel::new(&faults, seed),
             now: 0,

@@ -8,7 +8,7 @@ use scanhub_drivers::ld::Model;
 use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::{ld, line};
 use scanhub_schema::{MILLIS, Nanos};
-use scanhub_sim::ld::{LdSettings, Packets, recorded};
+use scanhub_sim::ld::{LdSettings, LdSimulator, recorded};
 use scanhub_sim::world::World;
 
 const SECOND: Nanos = 1_000 * MILLIS;
@@ -215,8 +215,9 @@ fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     assert!(none.message.contains("no packet"), "{none}");
     assert_eq!(found, packets);
     for looped in [false, true] {
-        let source = Packets::Recorded { packets: found.clone(), looped };
-        let mut bench = Bench::of(LdSettings::of(Model::Ld06), source, "", 1);
+        let settings = LdSettings::of(Model::Ld06);
+        let head = LdSimulator::repeating(settings, found.clone(), looped);
+        let mut bench = Bench::of(settings, head, "", 1);
         bench.run(7 * SECOND);
         assert_eq!(bench.packets[..packets.len()], packets);
         assert_eq!(bench.packets.len() > packets.len(), looped);

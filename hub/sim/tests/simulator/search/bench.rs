@@ -11,7 +11,7 @@ use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
 use scanhub_sim::Arrival;
 use scanhub_sim::device::Device;
 use scanhub_sim::fault::Faults;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::machine::{self, LmsSimulator, Start};
 use scanhub_sim::operating::Operating;
 use scanhub_sim::room::Room;
@@ -137,7 +137,7 @@ pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
 
 pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
     let settings = LdSettings { seed, ..LdSettings::of(model) };
-    Box::new(LdSimulator::new(settings, Packets::Room(Box::new(room(seed)))))
+    Box::new(LdSimulator::new(settings, room(seed)))
 }
 
 /// Creates an RPLIDAR that streams or not, and reports this health.

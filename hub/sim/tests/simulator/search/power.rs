@@ -5,7 +5,7 @@ use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::PortKind;
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::device::Device;
-use scanhub_sim::ld::{LdSettings, LdSimulator, Packets};
+use scanhub_sim::ld::{LdSettings, LdSimulator};
 use scanhub_sim::machine::{self, LmsSimulator};
 use scanhub_sim::operating::Source;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
@@ -48,7 +48,7 @@ fn finds_rotating_scanners_that_get_power_later() {
     for model in ld::Model::ALL {
         let worst = worst(model.name(), 30 * SECOND, boot, |seed| {
             let settings = LdSettings { boot_ns: boot, seed, ..LdSettings::of(model) };
-            Box::new(LdSimulator::new(settings, Packets::Room(Box::new(bench::room(seed)))))
+            Box::new(LdSimulator::new(settings, bench::room(seed)))
         });
         assert!(worst <= 6 * SECOND);
     }
