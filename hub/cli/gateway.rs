@@ -7,9 +7,10 @@ use std::time::Duration;
 
 use clap::Args;
 use scanhub_config::SourceMap;
+use scanhub_network::{GatewayLook, GatewayOptions};
 use scanhub_schema::datagram::{Announce, GROUPS, PORT, group};
 use scanhub_schema::{Failure, Kind, Topic};
-use scanhub_verbs::{GatewayLook, GatewayOptions, duration};
+use scanhub_verbs::duration;
 
 use super::{Configured, Everywhere};
 
@@ -121,7 +122,7 @@ fn groups_and_topics() -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_verbs::network::Selection;
+    use scanhub_network::Selection;
 
     /// Reads a file of this repository, without line breaks, backquotes and the marks of doc comments.
     fn words_of(path: &str) -> String {

@@ -24,6 +24,6 @@ enum Order {
 impl Key {
     pub(crate) fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
         let Order::New { file } = &self.order;
-        scanhub_verbs::new_key(file, json, out)
+        scanhub_network::new_key(file, json, out)
     }
 }

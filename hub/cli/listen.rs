@@ -4,10 +4,10 @@ use std::io::{IsTerminal, stdout};
 use std::path::PathBuf;
 
 use clap::Args;
+use scanhub_network::ListenOptions;
 use scanhub_schema::Failure;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_shm::StateDirectory;
-use scanhub_verbs::ListenOptions;
 
 use super::{Everywhere, Limits};
 

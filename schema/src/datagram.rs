@@ -1,22 +1,18 @@
 //! A sample as one datagram, or as several if it is longer. Its format needs no library to read, and every field is
 //! checked before it is used.
 //!
-//! This module needs neither shared memory nor a heap. Sockets are in crate `lan`.
+//! This module needs neither shared memory nor a heap. Senders and receivers are in `clients/network`.
 
 mod announce;
-mod gateway_runs;
 mod payload;
-mod stream_stats;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
 use crate::Topic;
 
 pub use announce::{Announce, Announced};
-pub use gateway_runs::{Arrival, LIVES, Standing};
 pub use payload::{FixedPayload, Packed, UsedElements};
 pub(crate) use payload::{are_finite, packed_as_is, read_head, used_elements, write};
-pub use stream_stats::{Fresh, GivenUp, ROWS, Row, StreamStats, WINDOW};
 
 /// Bytes of the header.
 pub const HEAD: usize = 48;
@@ -253,7 +249,7 @@ const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 const _: () = assert!(cfg!(target_endian = "little"));
 
 /// Reason why a datagram is refused. The reasons are in the order of the checks, and the first check that fails counts.
-/// [`Datagram::read`] returns those up to the checksum, and [`StreamStats`] the others.
+/// [`Datagram::read`] returns those up to the checksum, [`Datagram::check_payload`] the last two, and receivers the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DatagramError {
     /// Fewer bytes than a header.

@@ -1,9 +1,8 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
+use scanhub_network::lan::{Fresh, GivenUp, ROWS, StreamStats};
 use scanhub_schema::Topic;
-use scanhub_schema::datagram::{
-    Announce, Datagram, DatagramError, Fresh, GivenUp, HEAD, Head, MTU_ETHERNET, Packed, ROWS, StreamStats,
-};
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
 
 /// Any datagrams, one after the other: each is counted once, what is refused changes nothing, and what is not, can be
 /// said again.

@@ -7,7 +7,8 @@ use std::net::{Ipv4Addr, UdpSocket};
 use crate::testkit::{
     INT, KILL, Outcome, Receiver, TERM, TestEnv, hash, in_a_network, is_class, number, read, skip, until,
 };
-use scanhub_schema::datagram::{Announce, Datagram, Packed, StreamStats};
+use scanhub_network::lan::StreamStats;
+use scanhub_schema::datagram::{Announce, Datagram, Packed};
 use scanhub_schema::{Scan, Topic, Verdict, Zones};
 use serde_json::{Value, json};
 

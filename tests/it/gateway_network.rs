@@ -10,7 +10,8 @@ use crate::testkit::{
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
-use scanhub_schema::datagram::{Announce, Datagram, Row, StreamStats};
+use scanhub_network::lan::{Row, StreamStats};
+use scanhub_schema::datagram::{Announce, Datagram};
 use scanhub_schema::{Background, Topic};
 use serde_json::Value;
 

@@ -8,7 +8,8 @@ use crate::testkit::{
     self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, let_pass, number, skip, spawn,
     succeeds, terminal, until, wall_ns,
 };
-use scanhub_schema::datagram::{DatagramError, HEAD, WINDOW};
+use scanhub_network::lan::WINDOW;
+use scanhub_schema::datagram::{DatagramError, HEAD};
 use scanhub_schema::{
     Background, BackgroundHead, Early, Foreground, Line, Lines, Mark, Marks, Motion, MotionMethod, Scan,
     ScanHead, State, Status, Topic, Verdict, Zones,

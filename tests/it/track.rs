@@ -230,7 +230,7 @@ fn packed(payload: &impl Packed) -> Vec<u8> {
 
 #[test]
 fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
-    in_own_process("scanhub_track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
+    in_own_process("track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
         let env = TestEnv::new();
         let site = env.file("site.toml", SITE);
         let file = recorded(&env, 22);

@@ -9,10 +9,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use scanhub_lan::address::{Address, LIVE, PREFIX, live};
+use scanhub_network::lan::address::{Address, LIVE, PREFIX, live};
+use scanhub_network::now;
 use scanhub_schema::datagram::{Datagram, DatagramError};
 use scanhub_schema::{Failure, Kind, Printable};
-use scanhub_verbs::network::{now, quiet};
+use scanhub_verbs::output::quiet;
 use serde::Serialize;
 
 use crate::diagnosis::{Diagnosis, UNREACHED};

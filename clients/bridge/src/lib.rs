@@ -1,5 +1,5 @@
-//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines, as `gateway` and `listen` do
-//! in a LAN. `scanhub_lan` decides which samples are sent and accepted, and counts the lost ones, without a network. Only
+//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines, as `gateway` and
+//! `listen` do in a LAN. `scanhub_network` decides which samples are sent and accepted, and counts the lost ones. Only
 //! module `session` uses Zenoh.
 #![forbid(unsafe_code)]
 
@@ -19,11 +19,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use scanhub_lan::outgoing::ANNOUNCE_EVERY;
+use scanhub_network::lan::outgoing::ANNOUNCE_EVERY;
+use scanhub_network::now;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::network::{End, LossyWriter, Output, now, quiet};
+use scanhub_verbs::lossy_writer::LossyWriter;
+use scanhub_verbs::output::{End, Output, quiet};
 
 pub use check::check;
 use report::Report;

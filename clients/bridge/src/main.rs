@@ -10,12 +10,12 @@ use std::sync::atomic::AtomicBool;
 
 use clap::Parser;
 use scanhub_bridge::{BridgeOptions, PublishOptions, Ros2Options, SendOptions, bridge, check};
+use scanhub_network::received_topics;
 use scanhub_ros::Names;
 use scanhub_ros::zenoh_wire::Distro;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
-use scanhub_verbs::network::received_topics;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
 #[derive(Debug, Parser)]

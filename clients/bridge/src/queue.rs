@@ -8,11 +8,13 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use scanhub_lan::Stamp;
-use scanhub_lan::outgoing::Sample;
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::outgoing::Sample;
+use scanhub_network::{Carrier, Forwarder, Selection, now};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::network::{Carrier, End, Forwarder, Notice, Selection, now};
+use scanhub_verbs::follow::Notice;
+use scanhub_verbs::output::End;
 
 use crate::session::{Connection, ZenohSession};
 

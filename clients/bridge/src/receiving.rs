@@ -9,10 +9,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use scanhub_lan::address::{ANNOUNCE, Address, LIVE, PREFIX, live};
+use scanhub_network::lan::address::{ANNOUNCE, Address, LIVE, PREFIX, live};
+use scanhub_network::{Origin, Reception, Wanted, Words, now};
 use scanhub_schema::datagram::{Datagram, HEAD, MAC};
 use scanhub_schema::{Failure, Topic};
-use scanhub_verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
+use scanhub_verbs::output::{End, Output};
 
 use crate::PublishOptions;
 use crate::session::{Connection, Subscriber, ZenohSession};

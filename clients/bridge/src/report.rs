@@ -3,7 +3,9 @@
 
 use std::io::Write;
 
-use scanhub_verbs::network::{End, Notice, Output, tell};
+use scanhub_network::tell;
+use scanhub_verbs::follow::Notice;
+use scanhub_verbs::output::{End, Output};
 use serde::Serialize;
 
 use crate::BridgeOptions;

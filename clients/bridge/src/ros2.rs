@@ -10,13 +10,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use scanhub_lan::Stamp;
-use scanhub_lan::outgoing::Sample;
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::outgoing::Sample;
+use scanhub_network::{Carrier, Selection, now, tell};
 use scanhub_ros::Names;
 use scanhub_ros::zenoh_wire::{self, Distro, Node, Qos};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::network::{Carrier, End, Output, Selection, now, tell};
+use scanhub_verbs::output::{End, Output};
 use serde::Serialize;
 
 use crate::queue::{self, Follower, Queue, Sender, Shared};

@@ -6,12 +6,13 @@ use std::collections::hash_map::Entry;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use scanhub_lan::Stamp;
-use scanhub_lan::address::{Address, LIVE, PREFIX};
-use scanhub_lan::outgoing::{Outgoing, Sample, Transmit};
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::address::{Address, LIVE, PREFIX};
+use scanhub_network::lan::outgoing::{Outgoing, Sample, Transmit};
+use scanhub_network::{Carrier, Life, Selection, account, begin_life, now};
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::network::{Carrier, End, Life, Output, Selection, account, begin_life, now};
+use scanhub_verbs::output::{End, Output};
 
 use crate::SendOptions;
 use crate::queue::{Follower, Queue, Sender, Shared};

@@ -8,14 +8,14 @@ use std::time::Duration;
 
 /// Work in a thread of its own. Dropped, nobody waits for its result any more.
 #[derive(Debug)]
-pub(crate) struct BackgroundTask<T>(Receiver<T>);
+pub struct BackgroundTask<T>(Receiver<T>);
 
 /// So often it is seen that nobody wants to wait any more.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> BackgroundTask<T> {
     /// Begins it; nothing if there is no thread to be had: then it is to be tried again.
-    pub(crate) fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
+    pub fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
         let (done, result) = channel();
         let thread = thread::Builder::new().name("errand".into()).spawn(move || {
             let _ = done.send(work());
@@ -24,12 +24,12 @@ impl<T: Send + 'static> BackgroundTask<T> {
     }
 
     /// Its result, once, as soon as there is one.
-    pub(crate) fn result(&self) -> Option<T> {
+    pub fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }
 
     /// Its result, waited for; nothing if `stop` is set before there is one.
-    pub(crate) fn wait(&self, stop: &AtomicBool) -> Option<T> {
+    pub fn wait(&self, stop: &AtomicBool) -> Option<T> {
         while !stop.load(Ordering::Relaxed) {
             match self.0.recv_timeout(LOOK_EVERY) {
                 Err(RecvTimeoutError::Timeout) => {}

@@ -10,7 +10,7 @@ use crate::background_task::BackgroundTask;
 
 /// The calls of the sensors of a hub that came.
 #[derive(Default)]
-pub(crate) struct Discovery {
+pub struct Discovery {
     /// When the hub came, and how often its sensors were called.
     hub: Option<(Instant, usize)>,
     /// The call that is under way, and how long after the hub it began.
@@ -22,13 +22,13 @@ pub(crate) struct Discovery {
 type Answer = Result<Vec<(String, Topic)>, Failure>;
 
 /// What was answered.
-pub(crate) struct Called {
+pub struct Called {
     /// The sensors that have topics, sorted.
-    pub(crate) sensors: Vec<String>,
+    pub sensors: Vec<String>,
     /// Who has made their topics.
     makers: Vec<(String, Maker)>,
     /// So long after the hub came it was asked.
-    pub(crate) age: Duration,
+    pub age: Duration,
 }
 
 /// When the sensors of a hub that came are called: it makes their topics one after the other.
@@ -56,31 +56,31 @@ impl Called {
     }
 
     /// Whether `sensor` has `topic`, now or when all its topics are made: a name has all topics of the maker of one.
-    pub(crate) fn may_have(&self, sensor: &str, topic: Topic) -> bool {
+    pub fn may_have(&self, sensor: &str, topic: Topic) -> bool {
         self.makers.iter().any(|(name, maker)| name == sensor && *maker == topic.maker())
     }
 }
 
 impl Discovery {
     /// A hub came; answers about the one before are of no use.
-    pub(crate) fn begin(&mut self, now: Instant) {
+    pub fn begin(&mut self, now: Instant) {
         *self = Discovery { hub: Some((now, 0)), call: None, is_answered: false };
     }
 
     /// The hub is gone: nobody waits for what it has.
-    pub(crate) fn end(&mut self) {
+    pub fn end(&mut self) {
         self.call = None;
     }
 
     /// There was a hub.
-    pub(crate) fn has_begun(&self) -> bool {
+    pub fn has_begun(&self) -> bool {
         self.hub.is_some()
     }
 
     /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time.
     ///
     /// [`Kind::Failed`](scanhub_schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
-    pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
+    pub fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((task, age)) = &self.call {
             let Some(answer) = task.result() else { return Ok(None) };
             let called = answer.map(|published| Called::of(&published, *age));
@@ -103,7 +103,7 @@ impl Discovery {
     }
 
     /// After which time there may be an answer.
-    pub(crate) fn left(&self) -> Option<Duration> {
+    pub fn left(&self) -> Option<Duration> {
         self.call.as_ref().map(|_| LOOK_EVERY)
     }
 }

@@ -63,13 +63,14 @@ impl<'a> Stamp<'a> {
 
 /// What they end with: which flags are set, if any is.
 #[derive(Serialize)]
-pub(crate) struct Words {
+pub struct Words {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     flags: Vec<&'static str>,
 }
 
 impl Words {
-    pub(crate) fn of(header: &Header) -> Words {
+    /// Returns the names of the flags in `header`.
+    pub fn of(header: &Header) -> Words {
         Words { flags: Flags::names(header.flags).collect() }
     }
 }

@@ -17,7 +17,7 @@ impl TopicName {
     /// The topic that `text` names, as in `front/scan`; `robot/zones` is the fold over all sensors.
     ///
     /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
-    pub(crate) fn parse(text: &str) -> Result<TopicName, Failure> {
+    pub fn parse(text: &str) -> Result<TopicName, Failure> {
         let unknown = |how: String| {
             Failure::new(Kind::Usage, format!("no topic {text:?}"), format!("{how}{}", topics()))
         };
@@ -37,7 +37,7 @@ impl TopicName {
     }
 
     /// Not one sensor's topic but the fold over all of them.
-    pub(crate) fn is_robot(&self) -> bool {
+    pub fn is_robot(&self) -> bool {
         self.sensor == ROBOT && self.topic == Topic::Zones
     }
 }
@@ -49,7 +49,7 @@ impl fmt::Display for TopicName {
 }
 
 /// The position of what publishes as `name` beside a hub: numbers from 128 on are of no link.
-pub(crate) fn position(name: &str) -> u8 {
+pub fn position(name: &str) -> u8 {
     const FIRST: u8 = 128;
     let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
     FIRST + (sum % u32::from(u8::MAX - FIRST)) as u8
@@ -61,12 +61,12 @@ pub fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
 }
 
 /// All topics of a sensor.
-pub(crate) fn topics() -> String {
+pub fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
 /// The topic that `word` may have been meant for, if one is near.
-pub(crate) fn nearest(sensor: &str, word: &str) -> String {
+pub fn nearest(sensor: &str, word: &str) -> String {
     let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
@@ -81,7 +81,7 @@ fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str>
 const NEAR: f64 = 0.8;
 
 /// The sensor of `name` has other topics than that, and never will have it.
-pub(crate) fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
+pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
     let who = topics
@@ -91,7 +91,7 @@ pub(crate) fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
 }
 
 /// The hub has no `sensor`, but `sensors`.
-pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
+pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
         [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
         some => {

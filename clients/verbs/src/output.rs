@@ -80,7 +80,7 @@ impl<'a> Output<'a> {
     }
 
     /// Bytes as they are.
-    pub(crate) fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
+    pub fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
         self.out.write_all(bytes)?;
         Ok(self.out.flush()?)
     }
@@ -111,7 +111,7 @@ fn disarm(text: &mut [u8]) {
 }
 
 /// Writes `rows` as columns, each as wide as its widest cell; numbers to the right, for people.
-pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
+pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
     let width =
         |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
@@ -137,7 +137,7 @@ pub(crate) fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(),
 
 /// The columns of the terminal that `out` is, if it is one that says so.
 #[cfg(feature = "record")]
-pub(crate) fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {
+pub fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {
     let size = rustix::termios::tcgetwinsize(out).ok()?;
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
@@ -145,7 +145,7 @@ pub(crate) fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {
 /// `parts` with two blanks between them, in at most so many `columns`: of those that do not fit the one with the lowest rank
 /// goes first. A number that is cut would be another number. The last one stays, however long.
 #[cfg(feature = "record")]
-pub(crate) fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
+pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     let length =
         |parts: &[(u8, String)]| parts.iter().map(|(_, part)| part.chars().count() + 2).sum::<usize>();
     while parts.len() > 1 && length(&parts) > columns + 2 {

@@ -7,18 +7,18 @@ use crate::names::{TopicName, as_word, nearest, topics};
 
 /// What one word stands for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Word {
+pub struct Word {
     /// The sensor; nothing: all of them.
-    pub(crate) sensor: Option<String>,
+    pub sensor: Option<String>,
     /// The topic; nothing: all of them.
-    pub(crate) topic: Option<Topic>,
+    pub topic: Option<Topic>,
 }
 
 impl Word {
     /// What `text` stands for; `robot/zones` is the fold over all sensors.
     ///
     /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
-    pub(crate) fn parse(text: &str) -> Result<Word, Failure> {
+    pub fn parse(text: &str) -> Result<Word, Failure> {
         let (sensor, topic) = text.split_once('/').unwrap_or((text, ""));
         match (sensor, topic) {
             (ALL, ALL) => Ok(Word { sensor: None, topic: None }),

@@ -15,7 +15,7 @@ use crate::output::{End, Output};
 use crate::{json, text};
 
 /// Takes the keys of one line.
-pub(crate) trait Keys {
+pub trait Keys {
     /// Writes them.
     fn take(self, keys: impl Serialize) -> Result<(), End>;
 }
@@ -27,7 +27,7 @@ impl Keys for &mut Output<'_> {
 }
 
 /// The payload of a topic.
-pub(crate) trait Show {
+pub trait Show {
     /// The line of JSON, given to `to`.
     fn json(&self, sensor: &str, header: &Header, to: impl Keys) -> Result<(), End>;
 
@@ -119,7 +119,7 @@ impl ShowSample for RobotHeard {
 macro_rules! samples {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// The line of JSON of a sample of `sensor`.
-        pub(crate) fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), End> {
+        pub fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), End> {
             match sample {
                 $(Sample::$topic(sample) => sample.json(sensor, to),)*
                 Sample::Robot(sample) => sample.json(sensor, to),
@@ -127,7 +127,7 @@ macro_rules! samples {
         }
 
         /// What stands behind the topic's name on a line for people.
-        pub(crate) fn text(sample: &Sample, line: &mut Vec<u8>) -> io::Result<()> {
+        pub fn text(sample: &Sample, line: &mut Vec<u8>) -> io::Result<()> {
             match sample {
                 $(Sample::$topic(sample) => sample.text(line),)*
                 Sample::Robot(sample) => sample.text(line),

@@ -5,7 +5,8 @@ use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
     number, read, skip, until,
 };
-use scanhub_schema::datagram::{Datagram, Packed, StreamStats};
+use scanhub_network::lan::StreamStats;
+use scanhub_schema::datagram::{Datagram, Packed};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
 
@@ -45,7 +46,7 @@ fn account(heard: &[Vec<u8>]) -> (u64, u64) {
 
 #[test]
 fn a_cable_is_pulled_and_an_address_taken() {
-    in_a_network("scanhub_lan::trouble::a_cable_is_pulled_and_an_address_taken", || {
+    in_a_network("lan::trouble::a_cable_is_pulled_and_an_address_taken", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -77,7 +78,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
 
 #[test]
 fn a_queue_is_full() {
-    in_a_network("scanhub_lan::trouble::a_queue_is_full", || {
+    in_a_network("lan::trouble::a_queue_is_full", || {
         let robot = Robot::new(&["front"]);
         let receiver = Receiver::new(robot.machine.here());
         let mut gateway = robot.gateway::<&str>(&[]);
@@ -102,7 +103,7 @@ fn a_queue_is_full() {
 
 #[test]
 fn hosts_that_are_not_there_disturb_nobody() {
-    in_a_network("scanhub_lan::trouble::hosts_that_are_not_there_disturb_nobody", || {
+    in_a_network("lan::trouble::hosts_that_are_not_there_disturb_nobody", || {
         let robot = Robot::new(&["front"]);
         let here = robot.machine.here();
         ip("link set lo up");
@@ -131,7 +132,7 @@ fn hosts_that_are_not_there_disturb_nobody() {
 
 #[test]
 fn hubs_and_gateways_are_killed() {
-    in_a_network("scanhub_lan::trouble::hubs_and_gateways_are_killed", || {
+    in_a_network("lan::trouble::hubs_and_gateways_are_killed", || {
         let second = Machine::new(2);
         let mut robot = Robot::new(&["front"]);
         let relay = Relay::new(&robot.machine, 7);

@@ -23,7 +23,7 @@ fn tests_do_not_depend_on_time() {
             tree.with("tests/it/planted.rs", "//! Sleeps.\nstd::thread::sleep(Duration::from_secs(1));\n"),
             tree.with("hub/drivers/tests/planted.rs", "//! Sleeps.\nsleep(Duration::from_secs(1));\n"),
             tree.with(
-                "clients/lan/tests/planted.rs",
+                "clients/network/tests/planted.rs",
                 "//! Compares.\nassert!(begun.elapsed() < Duration::from_secs(1));\n",
             ),
         ]

@@ -1,7 +1,8 @@
 //! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
 
-use scanhub_lan::outgoing;
-use scanhub_schema::datagram::{Datagram, DatagramError, Row};
+use scanhub_network::lan::Row;
+use scanhub_network::lan::outgoing;
+use scanhub_schema::datagram::{Datagram, DatagramError};
 use scanhub_schema::{Header, Nanos, Ring, Status, Topic, Verdict, Zones};
 use scanhub_sim::ld::TruePoint;
 

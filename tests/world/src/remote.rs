@@ -12,7 +12,7 @@ use std::num::NonZeroU64;
 use std::time::Duration;
 
 use scanhub_client::clock::Moment;
-use scanhub_lan::{Key, Stamp};
+use scanhub_network::lan::{Key, Stamp};
 use scanhub_schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
 use scanhub_schema::{MICROS, MILLIS, Nanos, Topic};
 

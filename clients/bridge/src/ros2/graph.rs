@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::ops::Index;
 
-use scanhub_lan::Stamp;
-use scanhub_lan::outgoing::{PayloadRef, Sample};
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::outgoing::{PayloadRef, Sample};
 use scanhub_ros::zenoh_wire::Qos;
 use scanhub_ros::{DIAGNOSTICS, Names, TF_STATIC, Type};
 use scanhub_schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};

@@ -4,7 +4,8 @@ use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::rc::Rc;
 
-use scanhub_schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed, WINDOW};
+use scanhub_network::lan::WINDOW;
+use scanhub_schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed};
 use scanhub_schema::{Flags, Header, MILLIS, Nanos, Quality, Scan, State, Status, Topic, Zones};
 
 use super::{Judge, Say};

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use scanhub_lan::Key;
+use scanhub_network::lan::Key;
 use scanhub_schema::Nanos;
 use scanhub_schema::datagram::{Datagram, HEAD, Head, LanFlags, MAC};
 

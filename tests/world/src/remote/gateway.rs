@@ -2,8 +2,10 @@
 
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Noted, Numbers, ZonesState};
-use scanhub_lan::Stamp;
-use scanhub_lan::outgoing::{ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit};
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::outgoing::{
+    ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit,
+};
 use scanhub_schema::datagram::{Datagram, HEAD, PARTS};
 use scanhub_schema::{MILLIS, Nanos, Topic};
 

@@ -5,9 +5,9 @@ use std::collections::{HashMap, VecDeque};
 
 use scanhub_client::Robot;
 use scanhub_client::streams::ZonesState;
-use scanhub_lan::Stamp;
-use scanhub_lan::incoming::{Arrived, Incoming};
-use scanhub_lan::republish::Republisher;
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::incoming::{Arrived, Incoming};
+use scanhub_network::lan::republish::Republisher;
 use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, Packed};
 use scanhub_schema::{Nanos, Topic, Verdict, Zones};
 

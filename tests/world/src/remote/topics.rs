@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use scanhub_lan::republish::{SensorTopics, TopicStore};
+use scanhub_network::lan::republish::{SensorTopics, TopicStore};
 use scanhub_schema::{Failure, Header, Topic, Wake};
 
 /// Topics in memory, by their sensors' names. They stay when who publishes is gone.

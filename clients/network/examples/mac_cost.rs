@@ -1,0 +1,62 @@
+//! What it costs to check the MAC of a scan, compared with its checksum alone: `cargo run --release -p scanhub-network --example mac_cost`.
+//! A scan of 361 beams is one datagram, one of 3,240 beams with exact angles comes in parts. The least of many runs counts.
+#![allow(clippy::print_stdout)]
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use scanhub_network::lan::Key;
+use scanhub_schema::datagram::{Datagram, HEAD, Head, MAC, MTU_SAFE};
+
+/// Scans in a run, and runs.
+const SCANS: u32 = 200;
+const RUNS: usize = 40;
+
+/// The datagrams of a payload of `len` bytes, with a MAC each.
+fn datagrams(key: &Key, len: usize) -> Vec<Vec<u8>> {
+    let room = MTU_SAFE - HEAD - MAC;
+    let payload: Vec<u8> = (0..len).map(|at| (at * 7) as u8).collect();
+    let parts = len.div_ceil(room) as u8;
+    let part = |(part, payload): (usize, &[u8])| {
+        let mut buffer = [0; MTU_SAFE];
+        buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+        let head = Head { topic: 2, revision: 1, part: part as u8, parts, ..Head::default() };
+        head.seal_with(&mut buffer, payload.len(), |covered| key.mac(covered)).expect("room").to_vec()
+    };
+    payload.chunks(room).enumerate().map(part).collect()
+}
+
+/// The least time that `work` takes for all datagrams of a scan, in ns.
+fn least_ns(datagrams: &[Vec<u8>], work: impl Fn(&[u8])) -> f64 {
+    let run = |_| {
+        let begin = Instant::now();
+        for _ in 0..SCANS {
+            datagrams.iter().for_each(|bytes| work(black_box(bytes)));
+        }
+        begin.elapsed().as_nanos() as f64 / f64::from(SCANS)
+    };
+    (0..RUNS).map(run).fold(f64::INFINITY, f64::min)
+}
+
+fn main() {
+    let key = Key::new(&[7; Key::LEN]);
+    for (beams, of_beam) in [(361, 3), (3_240, 7)] {
+        let datagrams = datagrams(&key, 64 + beams * of_beam);
+        let checksum = least_ns(&datagrams, |bytes| {
+            black_box(Datagram::read(bytes).is_ok());
+        });
+        let both = least_ns(&datagrams, |bytes| {
+            let mac = Datagram::read(bytes).ok().and_then(|datagram| datagram.mac);
+            assert!(mac.is_some_and(|mac| key.is_of(bytes, mac)));
+        });
+        let (count, bytes) = (datagrams.len(), datagrams.iter().map(Vec::len).sum::<usize>());
+        let of = |ns: f64| ns / count as f64;
+        println!(
+            "{beams} beams, {count} datagrams, {bytes} bytes: checksum {:.0} ns, with MAC {:.0} ns a datagram; {:.1} and {:.1} us a scan",
+            of(checksum),
+            of(both),
+            checksum / 1e3,
+            both / 1e3
+        );
+    }
+}

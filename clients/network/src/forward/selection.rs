@@ -1,0 +1,205 @@
+//! What goes out: topics of sensors, and every how manieth sample of each. Refuses to know which sensors there are.
+
+use std::num::NonZeroU64;
+
+use scanhub_schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
+
+use scanhub_verbs::selection::Word;
+
+/// The topics that go out.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    entries: Vec<Entry>,
+}
+
+#[derive(Clone, Debug)]
+struct Entry {
+    word: Word,
+    every: NonZeroU64,
+}
+
+impl Selection {
+    /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
+    /// named means all sensors. It then means telegrams if `bare`, and otherwise the topics that
+    /// [`is_default`](Self::is_default) accepts.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Usage`] with the topics that there are, or if a name or a number is not possible, something is named twice,
+    /// or is no telegram and `bare`.
+    pub fn parse(texts: &[String], bare: bool) -> Result<Selection, Failure> {
+        let mut entries: Vec<Entry> = Vec::new();
+        for text in texts {
+            let entry = Entry::parse(text)?;
+            if bare && entry.word.topic != Some(Topic::Telegram) {
+                let hint = "without --bare all topics can be sent";
+                return Err(refuse(text, "has no telegrams, and --bare sends nothing else", hint));
+            }
+            if entries.iter().any(|other| other.word == entry.word) {
+                return Err(refuse(text, "is named twice", "name each topic once"));
+            }
+            entries.push(entry);
+        }
+        if entries.is_empty() {
+            let is_sent = |topic: &Topic| match bare {
+                true => *topic == Topic::Telegram,
+                false => Selection::is_default(*topic),
+            };
+            let all = Topic::ALL.into_iter().filter(is_sent);
+            entries.extend(all.map(|topic| Entry {
+                word: Word { sensor: None, topic: Some(topic) },
+                every: NonZeroU64::MIN,
+            }));
+        }
+        Ok(Selection { entries })
+    }
+
+    /// Returns whether `topic` is sent unless topics are named. Telegrams and clouds are many bytes; lines, motion and early
+    /// warnings cost CPU time only while they have a subscriber.
+    pub fn is_default(topic: Topic) -> bool {
+        !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud)
+    }
+
+    /// Every how manieth sample of this topic goes out, if any do: what names it closest wins.
+    pub(super) fn every(&self, sensor: &str, topic: Topic) -> Option<NonZeroU64> {
+        let word = |sensor: Option<&str>, topic| Word { sensor: sensor.map(str::to_owned), topic };
+        let closest = [(Some(sensor), Some(topic)), (Some(sensor), None), (None, Some(topic)), (None, None)];
+        let find = |wanted: Word| self.entries.iter().find(|entry| entry.word == wanted);
+        closest.into_iter().find_map(|(sensor, topic)| find(word(sensor, topic))).map(|entry| entry.every)
+    }
+
+    /// Returns whether this topic goes out of any sensor.
+    pub fn names(&self, topic: Topic) -> bool {
+        self.entries.iter().any(|entry| entry.word.topic.is_none_or(|named| named == topic))
+    }
+
+    /// The sensors that are named, each once.
+    pub(super) fn named(&self) -> Vec<&str> {
+        let mut named: Vec<_> =
+            self.entries.iter().filter_map(|entry| entry.word.sensor.as_deref()).collect();
+        named.sort_unstable();
+        named.dedup();
+        named
+    }
+
+    /// Who makes the topics that the sensor is named with: its link, if all of them are meant.
+    pub(super) fn maker_of(&self, sensor: &str) -> Maker {
+        let words = self.entries.iter().map(|entry| &entry.word);
+        let mut makers = words
+            .filter(|word| word.sensor.as_deref() == Some(sensor))
+            .filter_map(|word| word.topic.map(Topic::maker));
+        makers.find(|maker| *maker != Maker::Link).unwrap_or(Maker::Link)
+    }
+
+    /// Something goes out of sensors that are not named.
+    pub(super) fn wants_all(&self) -> bool {
+        self.entries.iter().any(|entry| entry.word.sensor.is_none())
+    }
+}
+
+impl Entry {
+    fn parse(text: &str) -> Result<Entry, Failure> {
+        let (name, every) = match text.split_once(':') {
+            None => (text, NonZeroU64::MIN),
+            Some((name, every)) => {
+                let every = every.strip_prefix("every=").and_then(|number| number.parse().ok());
+                (name, every.ok_or_else(|| refuse(text, "cannot be thinned so", EVERY_FORM))?)
+            }
+        };
+        let word = Word::parse(name)?;
+        if word.sensor.as_deref() == Some(ROBOT) {
+            return Err(refuse(text, "is a fold", "*/zones sends the zones of each sensor"));
+        }
+        if word.sensor.as_deref().is_some_and(is_remote) {
+            let hint = "a gateway sends what the hub of its own machine publishes";
+            return Err(refuse(text, "is another machine's", hint));
+        }
+        if every > NonZeroU64::MIN && word.topic.is_none_or(|topic| topic.row().pace != Pace::Scan) {
+            return Err(refuse(text, "is not only of each telegram, and cannot be thinned", name));
+        }
+        Ok(Entry { word, every })
+    }
+}
+
+fn refuse(text: &str, what: &str, hint: &str) -> Failure {
+    Failure::new(Kind::Usage, format!("topic {text} {what}"), hint)
+}
+
+const EVERY_FORM: &str = "front/scan:every=4 keeps the samples of every fourth telegram";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn selection(texts: &[&str], bare: bool) -> Result<Selection, Failure> {
+        Selection::parse(&texts.iter().map(|&text| text.to_owned()).collect::<Vec<_>>(), bare)
+    }
+
+    fn every(selection: &Selection, sensor: &str, topic: Topic) -> Option<u64> {
+        selection.every(sensor, topic).map(NonZeroU64::get)
+    }
+
+    #[test]
+    fn all_but_what_runs_on_demand_or_nothing_but_telegrams() {
+        let usual = selection(&[], false).unwrap();
+        for topic in Topic::ALL {
+            let rare = [Topic::Telegram, Topic::Lines, Topic::Motion, Topic::Early, Topic::Cloud];
+            let is_usual = !rare.contains(&topic);
+            assert_eq!(every(&usual, "front", topic), is_usual.then_some(1));
+        }
+        let bare = selection(&[], true).unwrap();
+        for topic in Topic::ALL {
+            assert_eq!(every(&bare, "front", topic), (topic == Topic::Telegram).then_some(1));
+        }
+        let house = selection(&["front/*", "house/tracks"], false).unwrap();
+        assert_eq!((house.maker_of("front"), house.maker_of("house")), (Maker::Link, Maker::Tracker));
+        assert!(usual.wants_all() && bare.wants_all() && usual.named().is_empty());
+    }
+
+    #[test]
+    fn what_is_named_wins_over_all() {
+        let some = selection(&["*/scan:every=8", "front/scan:every=4", "front/zones"], false).unwrap();
+        assert_eq!(every(&some, "front", Topic::Scan), Some(4));
+        assert_eq!(every(&some, "rear", Topic::Scan), Some(8));
+        assert_eq!(
+            (every(&some, "front", Topic::Zones), every(&some, "rear", Topic::Zones)),
+            (Some(1), None)
+        );
+        assert_eq!((some.named(), some.wants_all()), (vec!["front"], true));
+        assert!(some.names(Topic::Zones) && !some.names(Topic::Marks));
+        assert!(selection(&["front/*"], false).unwrap().names(Topic::Marks));
+        assert!(!selection(&["front/zones"], false).unwrap().wants_all());
+        let front = selection(&["*/scan:every=8", "front/*", "front/marks:every=2"], false).unwrap();
+        assert_eq!(every(&front, "front", Topic::Scan), Some(1));
+        assert_eq!(every(&front, "front", Topic::Marks), Some(2));
+        assert_eq!(
+            (every(&front, "rear", Topic::Scan), every(&front, "rear", Topic::Marks)),
+            (Some(8), None)
+        );
+    }
+
+    #[test]
+    fn what_cannot_go_out_is_refused() {
+        let kind = |texts: &[&str], bare| selection(texts, bare).map(drop).map_err(|failure| failure.kind);
+        for bad in ["front", "front/scam", "*", "*/scam", "robot/scan"] {
+            assert_eq!(kind(&[bad], false), Err(Kind::Usage), "{bad}");
+        }
+        for bad in [
+            "Front/scan",
+            "robot/zones",
+            "robot1.front/zones",
+            "front/scan:every=0",
+            "front/scan:every=",
+            "front/scan:4",
+            "front/status:every=2",
+            "*/background:every=2",
+            "front/*:every=2",
+        ] {
+            assert_eq!(kind(&[bad], false), Err(Kind::Usage), "{bad}");
+        }
+        assert_eq!(kind(&["front/scan", "front/scan:every=2"], false), Err(Kind::Usage));
+        assert_eq!(kind(&["front/scan"], true), Err(Kind::Usage));
+        assert_eq!(kind(&["*/*"], true), Err(Kind::Usage));
+        assert_eq!(kind(&["front/telegram:every=2"], true), Ok(()));
+    }
+}

@@ -1,0 +1,116 @@
+//! The file with the key that gateways and listeners share. It is created here, and read only if no other user can read it.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use crate::lan::Key;
+use rustix::rand::{GetRandomFlags, getrandom};
+use scanhub_files::output::{PRIVATE, Target, unwritable};
+use scanhub_files::regular;
+use scanhub_schema::{Failure, Kind};
+use serde_json::json;
+
+use scanhub_verbs::output::{Output, quiet};
+
+/// Creates the file at `path` with a new random key, for this user only, and prints the key's name to `out`.
+///
+/// # Errors
+///
+/// [`Kind::Output`] if there is a file already, or if it cannot be written.
+pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    let mut bytes = [0; Key::LEN];
+    let filled = getrandom(&mut bytes, GetRandomFlags::empty());
+    if filled != Ok(Key::LEN) {
+        return Err(Failure::new(Kind::Failed, "the system gives no random bytes", "try again"));
+    }
+    let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).chain(["\n".into()]).collect();
+    let target = Target::open(path)?;
+    // No option replaces a key: other machines may have it.
+    if target.check(true)?.is_some() {
+        return Err(Failure::new(Kind::Output, format!("{} exists", path.display()), KEY_EXISTS));
+    }
+    let mut file = target.create_new(false, PRIVATE)?;
+    let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
+    written.map_err(|error| unwritable(path, &error))?;
+    let (path, name) = (path.display().to_string(), Key::new(&bytes).name());
+    let mut out = Output::new(out);
+    quiet(match json {
+        true => out.json(&json!({ "class": "key", "file": path, "key": name })),
+        false => out.line(|line| {
+            write!(
+                line,
+                "{path}: key {name}; copy the file to the other machines, and name it there by --key-file"
+            )
+        }),
+    })
+}
+
+/// Returns the key in the file at `path`: 32 bytes, or 64 hex digits.
+///
+/// # Errors
+///
+/// [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to another user, can
+/// be read or written by others, or contains no key.
+pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
+    let refuse = |what: String, hint: &str| {
+        Failure::new(Kind::Configuration, format!("key file {}: {what}", path.display()), hint)
+    };
+    let unreadable = |error: std::io::Error| {
+        let hint = "`scanhub key new FILE` makes one; this user must be able to read it";
+        Failure::new(Kind::Input, format!("key file {}: {error}", path.display()), hint)
+    };
+    let mut file: File = regular::open(path).map_err(unreadable)?;
+    let about = file.metadata().map_err(unreadable)?;
+    let (mode, owner, user) = (about.mode() & 0o777, about.uid(), rustix::process::geteuid().as_raw());
+    if owner != user {
+        let what = format!("it is user {owner}'s, and this is user {user}");
+        return Err(refuse(what, "copy it as this user, and `chmod 600` the copy"));
+    }
+    if mode & 0o077 != 0 {
+        let what = format!("its mode is {mode:04o}, so others can use the key");
+        return Err(refuse(what, "`chmod 600` it; if others may have read it, make a new one"));
+    }
+    let bytes = regular::read_all(&mut file, LONGEST).map_err(unreadable)?;
+    let key = parse(&bytes).ok_or_else(|| {
+        refuse(
+            format!("its {} bytes are no key", about.len()),
+            "32 bytes, or 64 hex digits; `scanhub key new FILE` makes one",
+        )
+    })?;
+    Ok(Key::new(&key))
+}
+
+fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
+    if let Ok(raw) = bytes.try_into() {
+        return Some(raw);
+    }
+    let (pairs, []) = bytes.trim_ascii_end().as_chunks::<2>() else { return None };
+    let byte = |pair: &[u8; 2]| u8::from_str_radix(str::from_utf8(pair).ok()?, 16).ok();
+    let is_hex = pairs.as_flattened().iter().all(u8::is_ascii_hexdigit);
+    pairs.iter().map(byte).collect::<Option<Vec<u8>>>().filter(|_| is_hex)?.try_into().ok()
+}
+
+/// Remedy for a file that is not replaced.
+const KEY_EXISTS: &str = "name another file, or remove this one if no gateway uses its key any more";
+/// More than any form of a key has.
+const LONGEST: u64 = 256;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_is_32_bytes_or_64_digits() {
+        let hex = "00ff".repeat(16);
+        let bytes = std::array::from_fn(|at| if at % 2 == 0 { 0 } else { 0xff });
+        assert_eq!(parse(hex.as_bytes()), Some(bytes));
+        assert_eq!(parse(format!("{}\r\n", hex.to_uppercase()).as_bytes()), Some(bytes));
+        assert_eq!(parse(&[10; 32]), Some([10; 32]), "raw, whatever the bytes are");
+        let signed = format!("+1{}", &hex[2..]);
+        for text in ["", "00", &hex[..62], &hex[..63], &format!("{hex}00"), &signed, &"g".repeat(64)] {
+            assert_eq!(parse(text.as_bytes()), None, "{text}");
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! What a sample is called where networks name what they carry: hub, sensor and topic, as a path. Who sends may write any
+//! name: here it is compared with what the datagram says of itself. Refuses to know who is allowed to send.
+
+use std::fmt;
+
+use scanhub_schema::datagram::{Announce, Datagram};
+use scanhub_schema::{Topic, check_sensor};
+
+use crate::lan::incoming::PeerTable;
+
+/// The name of a topic of a remote sensor: `scanhub/HUB/SENSOR/TOPIC`, HUB being 16 hex digits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Address<'a> {
+    /// The gateway.
+    pub hub: u64,
+    /// The sensor.
+    pub sensor: &'a str,
+    /// The topic; none of announcements.
+    pub topic: Option<Topic>,
+}
+
+/// What all names begin with.
+pub const PREFIX: &str = "scanhub";
+/// The last word of the name of announcements.
+pub const ANNOUNCE: &str = "announce";
+/// The last word of the names that are there as long as a hub or a sensor is.
+pub const LIVE: &str = "@live";
+
+impl<'a> Address<'a> {
+    /// Returns the address that is written so, if it is one.
+    pub fn parse(text: &'a str) -> Option<Address<'a>> {
+        let (hub, sensor, last) = words(text)?;
+        let topic = if last == ANNOUNCE { None } else { Some(Topic::parse(last)?) };
+        Some(Address { hub, sensor, topic })
+    }
+
+    /// Returns whether `datagram` may be sent under this name: it says the same of itself, and where only its number says
+    /// which sensor it is of, that one was announced under this name, or not yet.
+    pub fn is_of(&self, datagram: &Datagram<'_>, peers: &PeerTable) -> bool {
+        let head = &datagram.head;
+        let number = self.topic.map_or(Announce::NUMBER, Topic::number);
+        if (head.hub, head.topic) != (self.hub, number) {
+            return false;
+        }
+        match self.topic {
+            None => Announce::unpack(datagram.payload).is_none_or(|said| said.sensor() == self.sensor),
+            Some(_) => peers
+                .announced(head.hub, head.epoch, head.sensor)
+                .is_none_or(|known| known.sensor() == self.sensor),
+        }
+    }
+}
+
+impl fmt::Display for Address<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let topic = self.topic.map_or(ANNOUNCE, Topic::name);
+        write!(f, "{PREFIX}/{:016x}/{}/{topic}", self.hub, self.sensor)
+    }
+}
+
+/// Returns the hub and the sensor of a name that is there as long as the sensor is: `scanhub/HUB/SENSOR/@live`.
+pub fn live(text: &str) -> Option<(u64, &str)> {
+    let (hub, sensor, last) = words(text)?;
+    (last == LIVE).then_some((hub, sensor))
+}
+
+/// Hub, sensor and last word of a name.
+fn words(text: &str) -> Option<(u64, &str, &str)> {
+    let mut words = text.split('/');
+    let (prefix, hub) = (words.next()?, words.next()?);
+    let (sensor, last) = (words.next()?, words.next()?);
+    let is_hub = hub.len() == 16 && hub.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'));
+    let is_ours = prefix == PREFIX && is_hub && words.next().is_none() && check_sensor(sensor).is_ok();
+    Some((u64::from_str_radix(hub, 16).ok().filter(|_| is_ours)?, sensor, last))
+}
+
+#[cfg(test)]
+mod tests {
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{HEAD, Head, Packed};
+
+    use super::*;
+    use crate::lan::Stamp;
+    use crate::lan::incoming::Incoming;
+
+    #[test]
+    fn names_go_there_and_back() {
+        let scan = Address { hub: 0xab, sensor: "front", topic: Some(Topic::Scan) };
+        let text = "scanhub/00000000000000ab/front/scan";
+        assert_eq!((scan.to_string().as_str(), Address::parse(text)), (text, Some(scan)));
+        let announce = Address { topic: None, ..scan };
+        assert_eq!(Address::parse(&announce.to_string()), Some(announce));
+        assert_eq!(live("scanhub/00000000000000ab/front/@live"), Some((0xab, "front")));
+        for other in [
+            "scanhub/00000000000000AB/front/scan",
+            "scanhub/ab/front/scan",
+            "scanhub/+0000000000000ab/front/scan",
+            "scanhub/00000000000000ab/front/scam",
+            "scanhub/00000000000000ab/Front/scan",
+            "scanhub/00000000000000ab/robot/scan",
+            "scanhub/00000000000000ab/front/scan/more",
+            "other/00000000000000ab/front/scan",
+            "scanhub/00000000000000ab/front",
+            "scanhub//front/scan",
+            "",
+        ] {
+            assert!(Address::parse(other).is_none() && live(other).is_none(), "{other}");
+        }
+    }
+
+    #[test]
+    fn nobody_speaks_under_anothers_name() {
+        let sealed = |head: Head, pack: &dyn Fn(&mut [u8]) -> Option<usize>| {
+            let mut buffer = [0; 400];
+            let len = pack(&mut buffer[HEAD..]).unwrap();
+            head.seal(&mut buffer, len).unwrap().to_vec()
+        };
+        let zones = |hub, sensor| {
+            let topic = Topic::Zones.number();
+            let head = Head { topic, hub, sensor, epoch: 1, revision: 1, ..Head::default() };
+            sealed(head, &|room| Zones::unknown().pack(room))
+        };
+        let head = Head { hub: 5, epoch: 1, sensor: 2, revision: 1, ..Head::default() };
+        let announced = sealed(head, &|room| Announce::new(1, "front", "").pack(room));
+        let mut incoming = Incoming::new(&Topic::ALL);
+        let may = |incoming: &Incoming, name: &str, bytes: &[u8]| {
+            Address::parse(name).unwrap().is_of(&Datagram::read(bytes).unwrap(), incoming.peers())
+        };
+        let (front, rear) = ("scanhub/0000000000000005/front/zones", "scanhub/0000000000000005/rear/zones");
+        assert!(may(&incoming, rear, &zones(5, 2)), "nobody was announced yet");
+        assert!(!may(&incoming, "scanhub/0000000000000005/rear/announce", &announced));
+        assert!(may(&incoming, "scanhub/0000000000000005/front/announce", &announced));
+        incoming.receive(&announced, 0, Stamp::default(), &mut Vec::new());
+        assert!(may(&incoming, front, &zones(5, 2)) && !may(&incoming, rear, &zones(5, 2)));
+        assert!(!may(&incoming, front, &zones(6, 2)), "another hub");
+        assert!(!may(&incoming, "scanhub/0000000000000005/front/scan", &zones(5, 2)), "another topic");
+    }
+}

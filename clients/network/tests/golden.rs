@@ -1,0 +1,49 @@
+//! Golden datagrams of version 2, in `tests/vectors/datagram`, as a receiver without a key accepts or refuses them.
+//! `schema/tests/datagram.rs` tests their bytes.
+
+#[path = "../../../tests/it/lan/vectors.rs"]
+mod vectors;
+
+use scanhub_network::lan::{Fresh, StreamStats};
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, MTU_SAFE};
+use vectors::{Vector, bytes, vectors};
+
+#[test]
+fn receiver_accepts_or_refuses_them() {
+    let zones = bytes("zones.hex");
+    let zones = Datagram::read(&zones).unwrap();
+    for Vector { file, bytes: datagram, says } in vectors() {
+        if says["with_key"] == true {
+            continue;
+        }
+        let mut stats = StreamStats::new(&Topic::ALL);
+        for before in says["after"].as_array().into_iter().flatten() {
+            stats.receive(&bytes(before.as_str().unwrap()), 1, 0).unwrap();
+        }
+        // For a second, so that the gateways are known to deliver.
+        for (sequence, now_ns) in [(5000, 0), (5001, 1_000_000_000)] {
+            for hub in 0..says["after_hubs"].as_u64().unwrap_or_default() {
+                let bytes = sealed(Head { hub, sequence, ..zones.head }, zones.payload);
+                stats.receive(&bytes, 1, now_ns).unwrap();
+            }
+        }
+        let from = if says["from_another"] == true { 2 } else { 1 };
+        let result = stats.receive(&datagram, from, 1_000_000_000).map(|(_, fresh)| fresh);
+        let Some(refusal) = says["refusal"].as_str() else {
+            assert_eq!(result, Ok(Fresh::New), "{file}");
+            continue;
+        };
+        let refused = result.unwrap_err();
+        assert_eq!(refused.name(), refusal, "{file}");
+        for reason in DatagramError::ALL {
+            assert_eq!(stats.refused(reason), u64::from(reason == refused), "{file}, {}", reason.name());
+        }
+    }
+}
+
+fn sealed(head: Head, payload: &[u8]) -> Vec<u8> {
+    let mut buffer = [0; MTU_SAFE];
+    buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+    head.seal(&mut buffer, payload.len()).unwrap().to_vec()
+}

@@ -1,0 +1,353 @@
+//! A machine with a hub of two sensors and a gateway, in virtual time: sensors fall silent, hub and gateway start again. Keeps
+//! what was sent. Refuses to know what becomes of it.
+
+use std::collections::BTreeMap;
+use std::num::NonZeroU64;
+
+use fastrand::Rng;
+use scanhub_client::clock::Moment;
+use scanhub_client::streams::ZonesState;
+use scanhub_network::lan::Stamp;
+use scanhub_network::lan::outgoing::{Form, Outgoing, PayloadRef, Sample, Transmit};
+use scanhub_schema::datagram::Datagram;
+use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
+
+use crate::network::{Nanos, Network};
+
+/// What goes wrong here.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Mishaps {
+    /// Sensors fall silent.
+    pub(crate) silence: bool,
+    /// The hub starts again.
+    pub(crate) hub: bool,
+    /// When it does, its sensors may be in another order.
+    pub(crate) order: bool,
+    /// The gateway starts again.
+    pub(crate) gateway: bool,
+    /// The kernel does not take so many of what is sent, from 0 to 1.
+    pub(crate) refusal: f64,
+}
+
+/// The gateway's number.
+pub(crate) const HUB: u64 = 0xab;
+/// The sensors. The zones of the one at position n say n in `invalid_beams`.
+pub(crate) const NAMES: [&str; 2] = ["front", "rear"];
+/// Between two scans.
+pub(crate) const PERIOD_NS: Nanos = 26_640_000;
+const SECOND_NS: Nanos = 1_000_000_000;
+/// The hub says so long after the last scan that nothing is known.
+const UNKNOWN_AFTER_NS: Nanos = 2 * PERIOD_NS + 20_000_000;
+const NEVER: Nanos = Nanos::MAX;
+
+/// The machine.
+pub(crate) struct Sending {
+    rng: Rng,
+    mishaps: Mishaps,
+    /// Every how manieth sample goes out.
+    every: u64,
+    longest: usize,
+    /// CLOCK_MONOTONIC and the wall clock at the begin: they are not those of others.
+    clocks: Stamp,
+    boot: u64,
+    hub: Turns,
+    gateway: Turns,
+    sensors: [Sensor; 2],
+    outgoing: Outgoing,
+    epoch: u32,
+    announce_at: Nanos,
+    pub(crate) sent: Sent,
+}
+
+/// When something that runs ends, and begins again.
+struct Turns {
+    runs: bool,
+    at: Nanos,
+}
+
+struct Sensor {
+    /// Its position in the hub's configuration.
+    number: u8,
+    seq: u64,
+    verdict: Verdict,
+    scan_at: Nanos,
+    unknown_at: Nanos,
+    status_at: Nanos,
+    /// What the gateway knows of its zones.
+    state: ZonesState,
+}
+
+/// Epoch, sensor's number and topic's.
+pub(crate) type Key = (u32, u8, u8);
+/// The datagrams of a sample: what was handed to the network, or nothing where the kernel did not take it.
+pub(crate) type Parts = Vec<Option<Vec<u8>>>;
+
+/// Everything that was sent.
+#[derive(Default)]
+pub(crate) struct Sent {
+    /// The samples by their numbers.
+    pub(crate) datagrams: BTreeMap<Key, Vec<Parts>>,
+    /// The life of the hub in which zones were made that have this number in `nearest_mm`.
+    pub(crate) boots: Vec<u64>,
+}
+
+/// The way to the network.
+struct Uplink<'a> {
+    now: Nanos,
+    rng: &'a mut Rng,
+    refusal: f64,
+    sent: &'a mut Sent,
+    network: &'a mut Network,
+}
+
+impl Transmit for Uplink<'_> {
+    fn transmit(&mut self, datagram: &[u8], _group: u8, _above: u8) -> bool {
+        let head = Datagram::read(datagram).expect("a whole datagram").head;
+        let numbers = self.sent.datagrams.entry((head.epoch, head.sensor, head.topic)).or_default();
+        if head.part == 0 {
+            assert_eq!(numbers.len(), head.sequence as usize, "numbers are without gaps");
+            numbers.push(Vec::new());
+        }
+        let is_taken = self.rng.f64() >= self.refusal;
+        let parts = numbers.last_mut().expect("the first part goes out first");
+        assert_eq!(parts.len(), usize::from(head.part));
+        parts.push(is_taken.then(|| datagram.to_vec()));
+        if is_taken {
+            self.network.send(self.now, datagram);
+        }
+        is_taken
+    }
+}
+
+impl Sending {
+    /// Of zones every so many go out.
+    /// In datagrams of `longest` bytes at most.
+    pub(crate) fn new(seed: u64, mishaps: Mishaps, every: u64, longest: usize) -> Sending {
+        let mut rng = Rng::with_seed(seed);
+        let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
+        let epoch = 1_700_000_000;
+        let mut sending = Sending {
+            mishaps,
+            every,
+            clocks,
+            boot: 0,
+            hub: Turns { runs: false, at: 0 },
+            gateway: Turns { runs: false, at: 0 },
+            sensors: [0, 1].map(|number| Sensor::new(number, moment(clocks, 0))),
+            outgoing: gateway(epoch, every, longest),
+            longest,
+            epoch,
+            announce_at: SECOND_NS,
+            sent: Sent::default(),
+            rng,
+        };
+        sending.turn_hub(0);
+        sending.turn_gateway(0);
+        sending
+    }
+
+    /// From now on all runs, and nothing goes wrong.
+    pub(crate) fn calm(&mut self, now: Nanos) {
+        self.mishaps = Mishaps::default();
+        for runs in [&mut self.hub, &mut self.gateway] {
+            runs.at = if runs.runs { NEVER } else { now };
+        }
+        for sensor in &mut self.sensors {
+            sensor.scan_at = sensor.scan_at.min(now + PERIOD_NS);
+        }
+    }
+
+    /// When something happens next.
+    pub(crate) fn next(&self, now: Nanos) -> Nanos {
+        let turns = self.hub.at.min(self.gateway.at);
+        let announce_at = if self.gateway.runs { self.announce_at } else { NEVER };
+        let of_sensors = self.sensors.iter().map(|sensor| {
+            let left = sensor.state.left(moment(self.clocks, now)).filter(|_| self.gateway.runs);
+            let silence_at = left.map_or(NEVER, |left| now + left.as_nanos() as Nanos);
+            let spoken_at = sensor.scan_at.min(sensor.unknown_at).min(sensor.status_at);
+            silence_at.min(if self.hub.runs { spoken_at } else { NEVER })
+        });
+        of_sensors.fold(turns.min(announce_at), Nanos::min)
+    }
+
+    /// Does what is due.
+    pub(crate) fn step(&mut self, now: Nanos, network: &mut Network) {
+        if now >= self.hub.at {
+            self.turn_hub(now);
+        }
+        if now >= self.gateway.at {
+            self.end_gateway(now, network);
+            self.turn_gateway(now);
+        }
+        for position in 0..NAMES.len() {
+            if self.hub.runs {
+                self.speak(position, now, network);
+            }
+            let moment = moment(self.clocks, now);
+            if self.gateway.runs
+                && let Some(heard) = self.sensors[position].state.silence(moment)
+            {
+                self.hand_over(position, None, PayloadRef::Zones(&heard.zones), now, network);
+            }
+        }
+        if self.gateway.runs && now >= self.announce_at {
+            self.announce_at = now + SECOND_NS;
+            self.announce(now, network);
+        }
+    }
+
+    /// Says who all sensors are, once more.
+    pub(crate) fn announce(&mut self, now: Nanos, network: &mut Network) {
+        let Sending { rng, sent, outgoing, .. } = self;
+        let mut uplink = Uplink { now, rng, refusal: self.mishaps.refusal, sent, network };
+        outgoing.announce(stamp(self.clocks, now), &mut uplink);
+    }
+
+    fn turn_hub(&mut self, now: Nanos) {
+        self.hub.runs = !self.hub.runs;
+        if !self.hub.runs {
+            self.hub.at = now + self.rng.u64(30_000_000..2 * SECOND_NS);
+            return;
+        }
+        self.hub.at = if self.mishaps.hub { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
+        self.boot = self.rng.u64(1..);
+        if self.mishaps.order && self.rng.bool() {
+            self.sensors.iter_mut().for_each(|sensor| sensor.number ^= 1);
+        }
+        for sensor in &mut self.sensors {
+            sensor.seq = 0;
+            sensor.scan_at = now + self.rng.u64(1..PERIOD_NS);
+            sensor.unknown_at = NEVER;
+            sensor.status_at = now + self.rng.u64(1..SECOND_NS / 2);
+        }
+    }
+
+    fn turn_gateway(&mut self, now: Nanos) {
+        self.gateway.runs = !self.gateway.runs;
+        if !self.gateway.runs {
+            self.gateway.at = now + self.rng.u64(10_000_000..2 * SECOND_NS);
+            return;
+        }
+        self.gateway.at =
+            if self.mishaps.gateway { now + self.rng.u64(SECOND_NS..9 * SECOND_NS) } else { NEVER };
+        self.epoch += 1;
+        self.outgoing = gateway(self.epoch, self.every, self.longest);
+        self.announce_at = now + SECOND_NS;
+        let moment = moment(self.clocks, now);
+        self.sensors.iter_mut().for_each(|sensor| sensor.state = ZonesState::new(moment));
+    }
+
+    /// Half of the gateways are killed; the others have a last word.
+    fn end_gateway(&mut self, now: Nanos, network: &mut Network) {
+        if self.gateway.runs && self.rng.bool() {
+            self.announce(now, network);
+        }
+    }
+
+    /// What the hub publishes now of the sensor.
+    fn speak(&mut self, position: usize, now: Nanos, network: &mut Network) {
+        let Sensor { scan_at, unknown_at, status_at, .. } = self.sensors[position];
+        if now >= scan_at {
+            let silent_ns = if self.mishaps.silence && self.rng.u8(..) == 0 {
+                self.rng.u64(PERIOD_NS..4 * SECOND_NS)
+            } else {
+                PERIOD_NS
+            };
+            if self.rng.u8(..) < 8 {
+                let verdicts = [Verdict::Clear, Verdict::Clear, Verdict::Clear, Verdict::Slow, Verdict::Stop];
+                self.sensors[position].verdict = verdicts[self.rng.usize(..verdicts.len())];
+            }
+            let sensor = &mut self.sensors[position];
+            (sensor.scan_at, sensor.unknown_at) = (now + silent_ns, now + UNKNOWN_AFTER_NS);
+            let verdict = sensor.verdict;
+            self.publish_zones(position, verdict, now, network);
+            self.sensors[position].seq += 1;
+        } else if now >= unknown_at {
+            self.sensors[position].unknown_at = NEVER;
+            self.publish_zones(position, Verdict::Unknown, now, network);
+        }
+        if now >= status_at {
+            self.sensors[position].status_at = now + SECOND_NS;
+            let mut status = Status::default();
+            status.set_sensor_type("LMS200");
+            let header = self.header(position, now);
+            self.hand_over(position, Some(&header), PayloadRef::Status(&status), now, network);
+        }
+    }
+
+    fn publish_zones(&mut self, position: usize, verdict: Verdict, now: Nanos, network: &mut Network) {
+        let zones = Zones {
+            verdict: verdict as u8,
+            invalid_beams: position as u16,
+            nearest_mm: self.sent.boots.len() as u32,
+            ..Zones::unknown()
+        };
+        self.sent.boots.push(self.boot);
+        if self.gateway.runs {
+            let (header, moment) = (self.header(position, now), moment(self.clocks, now));
+            let heard = self.sensors[position].state.take(&header, &zones, 0, moment);
+            self.hand_over(position, Some(&header), PayloadRef::Zones(&heard.zones), now, network);
+        }
+    }
+
+    fn header(&self, position: usize, now: Nanos) -> Header {
+        let Stamp { monotonic_ns, wall_ns } = stamp(self.clocks, now);
+        let Sensor { number, seq, .. } = self.sensors[position];
+        Header {
+            seq,
+            stamp_first_ns: monotonic_ns,
+            stamp_last_ns: monotonic_ns,
+            wall_ns,
+            boot: self.boot,
+            sensor: number,
+            period_us: (PERIOD_NS / 1000) as u32,
+            ..Header::default()
+        }
+    }
+
+    /// Gives it to the gateway, if there is one.
+    fn hand_over(
+        &mut self,
+        position: usize,
+        header: Option<&Header>,
+        payload: PayloadRef<'_>,
+        now: Nanos,
+        network: &mut Network,
+    ) {
+        if self.gateway.runs {
+            let Sending { rng, sent, outgoing, .. } = self;
+            let mut uplink = Uplink { now, rng, refusal: self.mishaps.refusal, sent, network };
+            let sample = Sample { header, missed: 0, payload };
+            outgoing.sample(position, &sample, stamp(self.clocks, now), &mut uplink);
+        }
+    }
+}
+
+impl Sensor {
+    fn new(number: u8, now: Moment) -> Sensor {
+        let state = ZonesState::new(now);
+        let verdict = Verdict::Clear;
+        Sensor { number, seq: 0, verdict, scan_at: NEVER, unknown_at: NEVER, status_at: NEVER, state }
+    }
+}
+
+fn gateway(epoch: u32, every: u64, longest: usize) -> Outgoing {
+    let mut outgoing = Outgoing::new(HUB, epoch, Form::Sealed, longest);
+    for name in NAMES {
+        outgoing.follow(name, |topic| match topic {
+            Topic::Zones => NonZeroU64::new(every),
+            Topic::Status => NonZeroU64::new(1),
+            _ => None,
+        });
+    }
+    outgoing
+}
+
+fn stamp(clocks: Stamp, now: Nanos) -> Stamp {
+    Stamp { monotonic_ns: clocks.monotonic_ns + now, wall_ns: clocks.wall_ns + now }
+}
+
+fn moment(clocks: Stamp, now: Nanos) -> Moment {
+    let monotonic_ns = clocks.monotonic_ns + now;
+    Moment { monotonic_ns, boottime_ns: monotonic_ns }
+}
