@@ -558,8 +558,48 @@ const REACH_MM: u32 = 200;
 
 #[cfg(test)]
 mod tests {
+    use scanhub_schema::Code;
+
     use super::*;
-    use crate::reading::Reading;
+
+    /// Reading of one beam, as the design states it. [`measure`] does the same for whole scans, but faster.
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    enum Reading {
+        /// A range in mm.
+        Valid(u32),
+        /// No object within reach.
+        Far,
+        /// Unknown: dazzled, too weak a signal, a reading error.
+        Invalid,
+    }
+
+    impl Reading {
+        /// Returns the reading of beam `i` of `scan`. No return is the most frequent code in real rooms. Each processor decides
+        /// whether it means [`Reading::Far`] or [`Reading::Invalid`].
+        fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
+            match (scan.distance_mm(i), scan.code(i)) {
+                (Some(range_mm), _) => Reading::Valid(range_mm),
+                (None, Some(Code::Beyond)) => Reading::Far,
+                (None, Some(Code::NoReturn)) if no_return_is_far => Reading::Far,
+                _ => Reading::Invalid,
+            }
+        }
+    }
+
+    #[test]
+    fn codes_and_ranges() {
+        let mut ranges: Vec<u16> = (0..10).map(|code| 0x1FFF - code).collect();
+        ranges.push(0);
+        let scan = Scan::of(ScanHead::lms(11, 0, 500, 10, 13), &ranges);
+        let all = |far| (0..12).map(|i| Reading::of(&scan, i, far)).collect::<Vec<_>>();
+        let mut expected = vec![Reading::Invalid; 12];
+        expected[8] = Reading::Far;
+        expected[9] = Reading::Valid(81_820);
+        expected[10] = Reading::Valid(0);
+        assert_eq!(all(false), expected);
+        expected[0] = Reading::Far;
+        assert_eq!(all(true), expected, "and a beam that does not exist has no reading");
+    }
 
     #[test]
     fn readings_are_those_of_every_processor() {

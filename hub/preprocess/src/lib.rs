@@ -4,11 +4,10 @@
 #![forbid(unsafe_code)]
 
 pub mod background;
+mod directions;
 pub mod lines;
 pub mod marks;
 pub mod motion;
-#[cfg(test)]
-mod reading;
 pub mod segments;
 pub mod velocity;
 pub mod zones;

@@ -4,22 +4,22 @@
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
 //! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined to
-//! lines, the likeliest first, then the cuts between lines are moved (`cut`).
+//! lines, the likeliest first, then the cuts between lines are moved (`pieces`).
 //!
 //! Nothing is set by hand: the noise comes from the scan itself, and a line has to explain more than its numbers
 //! explain of mere noise, by a Bayesian information criterion.
 
-mod cut;
 mod fit;
-mod join;
+mod pieces;
 
 use std::f32::consts::{PI, TAU};
 
 use scanhub_schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
 
-use cut::{Bounds, Cutter};
+use crate::directions::Directions;
+
 use fit::{Information, Ray};
-use join::Piece;
+use pieces::{Bounds, Cutter, Piece};
 
 /// Which lines are looked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,10 +56,7 @@ impl Default for Settings {
 pub struct LineFinder {
     pose: Pose,
     settings: Settings,
-    /// First angle and step of the scans that the directions are for.
-    angles: Option<(f64, f64)>,
-    /// Where each beam points in the robot's frame: a unit vector.
-    directions: Box<[(f64, f64)]>,
+    directions: Directions,
     /// The beams that have a range, and their numbers.
     rays: Box<[Ray]>,
     beams: Box<[u16]>,
@@ -77,8 +74,7 @@ impl LineFinder {
         LineFinder {
             pose,
             settings,
-            angles: None,
-            directions: vec![(0.0, 0.0); beams].into(),
+            directions: Directions::new(beams),
             rays: vec![Ray::default(); beams].into(),
             beams: vec![0; beams].into(),
             ends: vec![0; beams].into(),
@@ -89,7 +85,7 @@ impl LineFinder {
 
     /// Goes on for a sensor at `pose` as `settings` say.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
-        (self.pose, self.settings, self.angles) = (pose, settings, None);
+        (self.pose, self.settings) = (pose, settings);
     }
 
     /// Writes the lines of `scan` into `out`, every byte of it.
@@ -121,33 +117,14 @@ impl LineFinder {
 
     /// Takes over the beams of `scan` that have a range; how many these are.
     fn read(&mut self, scan: &Scan) -> usize {
-        self.point(scan);
-        let unit_m = f64::from(scan.unit_um) * 1e-6;
-        let exact = scan.exact_angles();
+        self.directions.fit(&self.pose, scan);
         let mut count = 0;
-        for (i, even) in self.directions.iter().enumerate().take(scan.beams()) {
-            let range = scan.range(i).map_or(0.0, |range| f64::from(range) * unit_m);
-            if range <= 0.0 {
-                continue;
-            }
-            let exact = exact.get(i).filter(|exact| exact.is_finite());
-            let (cos, sin) = exact.map_or(*even, |&exact| self.pose.direction(exact.into()));
+        for (i, (cos, sin), range) in self.directions.readings(&self.pose, scan) {
             self.rays[count] = Ray { cos, sin, range };
             self.beams[count] = i as u16;
             count += 1;
         }
         count
-    }
-
-    /// Makes the table for scans with the angles of `scan`.
-    fn point(&mut self, scan: &Scan) {
-        let angles = Some((scan.first_angle, scan.step));
-        if self.angles != angles {
-            self.angles = angles;
-            for (i, direction) in self.directions.iter_mut().enumerate() {
-                *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
-            }
-        }
     }
 
     /// Where points are too far apart for one line; how many groups there are.

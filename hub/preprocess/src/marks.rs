@@ -5,6 +5,8 @@ use std::f64::consts::{PI, TAU};
 
 use scanhub_schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
 
+use crate::directions::exact_angle;
+
 /// What makes a mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
@@ -64,7 +66,14 @@ impl MarkDetector {
 
     /// Writes the marks, of which no beam has an intensity below `least`.
     fn find(&self, scan: &Scan, least: u16, out: &mut Marks) {
-        let mut list = List { scan, out, count: 0, overflow: false };
+        let (mut count, mut overflow) = (0, false);
+        let mut push = |open: &Open| match out.mark_array.get_mut(count) {
+            Some(mark) => {
+                *mark = open.mark(scan);
+                count += 1;
+            }
+            None => overflow = true,
+        };
         let unit_um = scan.unit_um;
         let mut open: Option<Open> = None;
         for (i, intensity) in scan.intensities().iter().enumerate() {
@@ -76,46 +85,25 @@ impl MarkDetector {
                     mark.join(scan, i, value, intensity);
                 }
                 (Some(value), _) => {
-                    open.replace(Open::at(scan, i, value, intensity)).inspect(|mark| list.push(mark));
+                    open.replace(Open::at(scan, i, value, intensity)).inspect(&mut push);
                 }
                 (None, Some(mark)) => {
                     mark.gap += 1;
                     if mark.gap > u32::from(self.settings.max_gap) {
-                        open.take().inspect(|mark| list.push(mark));
+                        open.take().inspect(&mut push);
                     }
                 }
                 (None, None) => {}
             }
         }
-        open.inspect(|mark| list.push(mark));
-        let List { count, overflow, .. } = list;
+        open.inspect(&mut push);
         out.count = count as u8;
         out.flags = if overflow { Marks::OVERFLOW } else { 0 };
     }
 }
 
-/// The marks that were closed.
-struct List<'a> {
-    scan: &'a Scan,
-    out: &'a mut Marks,
-    count: usize,
-    overflow: bool,
-}
-
-impl List<'_> {
-    fn push(&mut self, open: &Open) {
-        match self.out.mark_array.get_mut(self.count) {
-            Some(mark) => {
-                *mark = open.mark(self.scan);
-                self.count += 1;
-            }
-            None => self.overflow = true,
-        }
-    }
-}
-
 /// A mark that may go on: sums over its beams, in integers, so that they are the same on every machine.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Open {
     /// Sum of w.
     weight: u64,
@@ -134,17 +122,7 @@ struct Open {
 
 impl Open {
     fn at(scan: &Scan, i: usize, range: u16, intensity: u16) -> Open {
-        let mut open = Open {
-            weight: 0,
-            beams: 0,
-            off_udeg: 0,
-            ranges: 0,
-            last_range: range,
-            peak: 0,
-            gap: 0,
-            first_beam: i,
-            last_beam: i,
-        };
+        let mut open = Open { first_beam: i, ..Open::default() };
         open.join(scan, i, range, intensity);
         open
     }
@@ -193,8 +171,8 @@ fn in_range_mdeg(mdeg: i128) -> i32 {
 /// How far the exact angle of beam `i` is from that of the beam, in millionths of a degree: 0 where there is none. Either may
 /// be counted from another turn.
 fn off_udeg(scan: &Scan, i: usize) -> i64 {
-    let Some(exact) = scan.exact_angles().get(i).filter(|exact| exact.is_finite()) else { return 0 };
-    let off = f64::from(*exact) - (scan.first_angle + i as f64 * scan.step);
+    let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
+    let off = exact - (scan.first_angle + i as f64 * scan.step);
     let off = (off + PI).rem_euclid(TAU) - PI;
     (1e6 * in_degrees(off)).round() as i64
 }

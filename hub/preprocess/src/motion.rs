@@ -8,23 +8,19 @@
 //! Scans are compared with a scan that is kept until the robot has left its position, so a robot that stands does not
 //! drift.
 
+mod covariance;
 mod matching;
-mod rigid;
-mod undistorted;
-mod view;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use scanhub_schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
 
 use crate::lines::{self, LineFinder};
-use crate::velocity::{Velocity, times};
+pub use crate::velocity::Rigid;
+use crate::velocity::{UndistortedScan, Velocity, times};
 
-use matching::{Match, Matcher};
-pub use rigid::Rigid;
-use rigid::Square;
-use undistorted::UndistortedScan;
-use view::View;
+use covariance::Square;
+use matching::{Match, Matcher, SPACING_M, View};
 
 /// Limits of the steps that are accepted.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,6 +36,12 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Settings { max_step_m: 0.5, max_turn_deg: 30.0, min_overlap: 0.4 }
+    }
+}
+
+impl Settings {
+    fn allow(&self, step: &Rigid) -> bool {
+        step.x.hypot(step.y) <= self.max_step_m && step.yaw.abs() <= self.max_turn_deg.to_radians()
     }
 }
 
@@ -255,13 +257,11 @@ impl MotionEstimator {
 
     /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that is known.
     fn find(&mut self, track: &Track, begin: Option<Rigid>) -> Option<(Match, Rigid)> {
-        let Settings { max_step_m, max_turn_deg, min_overlap } = self.settings;
-        let limits = Limits { step_m: max_step_m, turn_rad: max_turn_deg.to_radians() };
-        let begin = begin.unwrap_or_else(|| initial_guess(&self.kept, &self.now, track, &limits));
-        let found = self.matcher.find(&self.kept, &self.now, begin, max_step_m)?;
+        let settings = self.settings;
+        let begin = begin.unwrap_or_else(|| initial_guess(&self.kept, &self.now, track, &settings));
+        let found = self.matcher.find(&self.kept, &self.now, begin, settings.max_step_m)?;
         let step = track.last.inverse().then(&found.place);
-        let is_near = step.x.hypot(step.y) <= limits.step_m && step.yaw.abs() <= limits.turn_rad;
-        (is_near && found.overlap >= min_overlap).then_some((found, step))
+        (settings.allow(&step) && found.overlap >= settings.min_overlap).then_some((found, step))
     }
 
     /// Keeps the current scan, with which later ones are compared.
@@ -271,7 +271,7 @@ impl MotionEstimator {
         let Track { origin, of_origin, last, of_last, .. } = track;
         self.track = Some(Track {
             origin: origin.then(&last),
-            of_origin: rigid::of_both(&of_origin, &of_last, &origin, &last),
+            of_origin: covariance::of_both(&of_origin, &of_last, &origin, &last),
             last: Rigid::default(),
             unsure: None,
             of_last: Square::default(),
@@ -279,12 +279,6 @@ impl MotionEstimator {
             ..track
         });
     }
-}
-
-/// Maximum motion of a robot from one scan to the next.
-struct Limits {
-    step_m: f64,
-    turn_rad: f64,
 }
 
 /// Returns `elapsed_ns` as a multiple of the period. A stamp has jitter if it is that of a telegram.
@@ -298,9 +292,9 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
     // Both scans have their own noise. That of the kept one moves both positions alike.
     let before = track.unsure.unwrap_or(found.of_kept);
-    let mut covariance = rigid::of_step(&found.own, &before, &track.last, step);
+    let mut covariance = covariance::of_step(&found.own, &before, &track.last, step);
     add_doubts(&mut covariance, track, found, step, offset);
-    out.covariance = rigid::rows(&covariance);
+    out.covariance = covariance::rows(&covariance);
     out.overlap = found.overlap as f32;
     // The covariance of a step contains that of both positions.
     let is_degenerate = found.is_degenerate || track.is_degenerate;
@@ -316,8 +310,8 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place
     (out.x_m, out.y_m, out.yaw_rad) = (place.x, place.y, place.yaw);
     out.breaks = track.breaks;
     if out.has_valid_pose() {
-        let covariance = rigid::of_both(&track.of_origin, of_place, &track.origin, &found.place);
-        out.pose_covariance = rigid::rows(&covariance);
+        let covariance = covariance::of_both(&track.of_origin, of_place, &track.origin, &found.place);
+        out.pose_covariance = covariance::rows(&covariance);
     }
 }
 
@@ -326,7 +320,7 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place
 fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) -> Square {
     let mut of_step = Square::default();
     add_doubts(&mut of_step, track, found, step, offset);
-    let of_step = rigid::turned(&of_step, &track.last);
+    let of_step = covariance::turned(&of_step, &track.last);
     let sum = |i: usize, j: usize| found.own[i][j] + found.of_kept[i][j] + of_step[i][j];
     std::array::from_fn(|i| std::array::from_fn(|j| sum(i, j)))
 }
@@ -335,8 +329,8 @@ fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64;
 fn add_doubts(covariance: &mut Square, track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) {
     // Readings on no surface contradict this step: according to them, the robot moved as before.
     let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
-    rigid::add_outer(covariance, &other, 1.0 - found.overlap);
-    rigid::add_outer(covariance, offset, 1.0);
+    covariance::add_outer(covariance, &other, 1.0 - found.overlap);
+    covariance::add_outer(covariance, offset, 1.0);
 }
 
 /// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion after
@@ -356,9 +350,9 @@ const ENOUGH: f64 = 0.5;
 
 /// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners and lines
 /// of the two scans that may be the same propose positions, and a few beams choose among them.
-fn initial_guess(kept: &View, now: &View, track: &Track, limits: &Limits) -> Rigid {
+fn initial_guess(kept: &View, now: &View, track: &Track, settings: &Settings) -> Rigid {
     let mut best =
-        Guess { kept, now, track, limits, place: track.last.then(&track.step), score: 0, tries: 0 };
+        Guess { kept, now, track, settings, place: track.last.then(&track.step), score: 0, tries: 0 };
     best.score = best.score(&best.place);
     best.try_place(track.last);
     best.try_corners();
@@ -372,7 +366,7 @@ struct Guess<'a> {
     kept: &'a View,
     now: &'a View,
     track: &'a Track,
-    limits: &'a Limits,
+    settings: &'a Settings,
     place: Rigid,
     score: usize,
     tries: usize,
@@ -403,8 +397,7 @@ impl Guess<'_> {
     /// Uses `place` if the robot can be there and more beams agree with it.
     fn try_place(&mut self, place: Rigid) {
         let step = self.track.last.inverse().then(&place);
-        let is_near = step.x.hypot(step.y) <= self.limits.step_m && step.yaw.abs() <= self.limits.turn_rad;
-        if !is_near || self.tries >= TRIES {
+        if !self.settings.allow(&step) || self.tries >= TRIES {
             return;
         }
         self.tries += 1;
@@ -471,8 +464,6 @@ const TRIES: usize = 64;
 /// Maximum distance of a beam's end from a surface, in standard deviations, and in addition to that in meters.
 const WIDTH: f64 = 3.0;
 const WIDTH_M: f64 = 0.01;
-/// As in `matching`.
-const SPACING_M: f64 = 0.2;
 /// Maximum difference of the opening of equal corners: 5 degrees.
 const ALIKE_RAD: f64 = 0.09;
 /// Minimum number of beams of a line whose direction is reliable.

@@ -7,16 +7,15 @@ use std::mem::{replace, take};
 
 use scanhub_schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
 
+use crate::directions::{Directions, exact_angle};
+
 /// Cuts the foreground of one sensor into segments.
 ///
 /// Points are computed in 64-bit floating point and rounded to mm: its four basic operations and the square root are
 /// the same on every machine.
 pub struct Segmenter {
     pose: Pose,
-    /// First angle and step of the scans that the tables below are for.
-    angles: Option<(f64, f64)>,
-    /// Where each beam points in the robot's frame: a unit vector.
-    directions: Box<[(f64, f64)]>,
+    directions: Directions,
     /// Of two neighbouring beams.
     step: Step,
     /// The foreground of the scan before.
@@ -54,7 +53,7 @@ impl Segmenter {
     pub fn new(pose: Pose, beams: usize) -> Segmenter {
         let points = || vec![(0.0, 0.0); beams].into();
         let [before, room] = [points(), points()].map(|places| Points { places, used: 0 });
-        Segmenter { pose, angles: None, directions: points(), step: Step::default(), before, room }
+        Segmenter { pose, directions: Directions::new(beams), step: Step::default(), before, room }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
@@ -66,7 +65,7 @@ impl Segmenter {
     /// A segment is supported if it has several beams, or if its point is at most 0.3 m from one of the foreground of the scan
     /// before: of the last one that was given here.
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
-        self.point(scan);
+        self.fit(scan);
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
         let head = **foreground;
         let ForegroundArrays { segments: places, bits, ranges } = foreground.begin(head);
@@ -108,7 +107,7 @@ impl Segmenter {
 
     /// As [`update`](Self::update) for a foreground of which nobody wants the segments: what supports the next ones is remembered.
     pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
-        self.point(scan);
+        self.fit(scan);
         let mut now = take(&mut self.room);
         now.used = 0;
         let head = **foreground;
@@ -132,11 +131,12 @@ impl Segmenter {
             while rest != 0 {
                 let beam = 8 * byte + rest.trailing_zeros() as usize;
                 rest &= rest - 1;
-                let (Some(&range), Some(&even)) = (ranges.next(), self.directions.get(beam)) else { return };
+                let (Some(&range), Some(on_grid)) = (ranges.next(), self.directions.on_grid(beam)) else {
+                    return;
+                };
                 let range_mm = f64::from(range) * unit_mm;
-                let exact = exact_angles.get(beam).filter(|exact| exact.is_finite());
-                let exact = exact.map(|&exact| f64::from(exact));
-                let (x, y) = exact.map_or(even, |exact| self.pose.direction(exact));
+                let exact = exact_angle(exact_angles, beam);
+                let (x, y) = exact.map_or(on_grid, |exact| self.pose.direction(exact));
                 say(beam, range, (range_mm, exact), (range_mm * x, range_mm * y));
             }
         }
@@ -150,17 +150,11 @@ impl Segmenter {
         (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * step.spread <= most * most
     }
 
-    /// Makes the tables for scans with the angles of `scan`.
-    fn point(&mut self, scan: &Scan) {
-        let angles = Some((scan.first_angle, scan.step));
-        if self.angles == angles {
-            return;
+    /// Adapts the directions and the step to scans such as `scan`.
+    fn fit(&mut self, scan: &Scan) {
+        if self.directions.fit(&self.pose, scan) {
+            self.step = Step::of(scan.step);
         }
-        self.angles = angles;
-        for (i, direction) in self.directions.iter_mut().enumerate() {
-            *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
-        }
-        self.step = Step::of(scan.step);
     }
 }
 

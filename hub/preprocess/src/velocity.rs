@@ -1,6 +1,9 @@
-//! Velocity of a robot that moves while a scan is measured.
+//! Motion of a robot in the plane: its velocity, transforms between its positions, and scans without the distortion by its
+//! motion, because it measures each beam from another position.
 
-use scanhub_schema::{Pose, Scan};
+use std::f64::consts::{PI, TAU};
+
+use scanhub_schema::{Contents, Pose, Scan, ScanHead, ScanWord};
 
 /// Velocity of a robot or of a sensor, in its own frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -75,6 +78,130 @@ impl Velocity {
     }
 }
 
+/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform from the
+/// frame of a robot there into that frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rigid {
+    /// Ahead.
+    pub x: f64,
+    /// To the left.
+    pub y: f64,
+    /// Direction.
+    pub yaw: f64,
+    cos: f64,
+    sin: f64,
+}
+
+impl Default for Rigid {
+    fn default() -> Self {
+        Rigid { x: 0.0, y: 0.0, yaw: 0.0, cos: 1.0, sin: 0.0 }
+    }
+}
+
+impl Rigid {
+    /// Creates the transform of position `x`, `y` and direction `yaw`.
+    pub fn new(x: f64, y: f64, yaw: f64) -> Rigid {
+        let (sin, cos) = yaw.sin_cos();
+        Rigid { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
+    }
+
+    /// Returns this transform followed by `next`, which is given in the frame of this one.
+    pub fn then(&self, next: &Rigid) -> Rigid {
+        let (x, y) = self.point((next.x, next.y));
+        Rigid::new(x, y, self.yaw + next.yaw)
+    }
+
+    /// Returns the inverse transform.
+    pub fn inverse(&self) -> Rigid {
+        let (x, y) = self.turned_back((-self.x, -self.y));
+        Rigid::new(x, y, -self.yaw)
+    }
+
+    /// Transforms a point out of this frame.
+    #[inline]
+    pub fn point(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        (self.x + self.cos * x - self.sin * y, self.y + self.sin * x + self.cos * y)
+    }
+
+    /// Transforms a direction out of this frame.
+    #[inline]
+    pub(crate) fn turned(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
+    }
+
+    /// Transforms a direction into this frame.
+    pub(crate) fn turned_back(&self, (x, y): (f64, f64)) -> (f64, f64) {
+        (self.cos * x + self.sin * y, self.cos * y - self.sin * x)
+    }
+}
+
+/// A scan as if the sensor had measured all beams at the scan's stamp.
+pub(crate) struct UndistortedScan {
+    words: Box<[ScanWord]>,
+    beams: usize,
+}
+
+impl UndistortedScan {
+    /// Allocates a scan of at most `beams` beams.
+    pub(crate) fn new(beams: usize) -> UndistortedScan {
+        UndistortedScan { words: vec![ScanWord::default(); beams + Scan::words(0)].into(), beams }
+    }
+
+    /// Computes `scan` without the distortion by a sensor that moves with `velocity`. Beams have exact angles. If two are measured in
+    /// the same direction, the nearer one remains.
+    pub(crate) fn compute(&mut self, scan: &Scan, velocity: &Velocity) -> &Scan {
+        let count = scan.beams().min(self.beams);
+        let [first_s, last_s] = times(scan);
+        let first_angle = scan.first_angle + velocity.yaw * (first_s + last_s) / 2.0;
+        let farthest_um = f64::from(scan.valid_to) * f64::from(scan.unit_um);
+        let unit_um = (farthest_um / f64::from(NO_RETURN)).ceil().max(1.0);
+        let head = ScanHead {
+            first_angle,
+            unit_um: unit_um as u32,
+            valid_to: NO_RETURN - 1,
+            no_return: NO_RETURN,
+            beyond: NO_RETURN,
+            count: count as u16,
+            contents: Contents::ANGLES,
+            turns: 1,
+            intensity_bits: 0,
+            ..**scan
+        };
+        let (old_m, new_m) = (1e-6 * f64::from(scan.unit_um), 1e-6 * unit_um);
+        let is_whole = is_whole(count, scan.step);
+        let arrays = Scan::of_words_mut(&mut self.words).begin(head);
+        arrays.angles.fill(f32::NAN);
+        arrays.ranges.fill(NO_RETURN);
+        for i in 0..count {
+            let Some(range) = scan.range(i).filter(|range| *range > 0) else { continue };
+            let (x, y, yaw) = velocity.position(1e-9 * scan.beam_ns(i) as f64);
+            let range = f64::from(range) * old_m;
+            let angle = scan.angle(i) + yaw;
+            let (sin, cos) = angle.sin_cos();
+            let (along, across) = (range + cos * x + sin * y, cos * y - sin * x);
+            let angle = angle + across.atan2(along);
+            let range = (along.hypot(across) / new_m).round();
+            let slot = (angle - first_angle) / scan.step;
+            let beam_of = |slot: f64| {
+                let beam = slot.round() as i64;
+                let beam = if is_whole { beam.rem_euclid(count as i64) } else { beam };
+                usize::try_from(beam).ok().filter(|beam| *beam < count)
+            };
+            let Some(mut beam) = beam_of(slot).filter(|_| range >= 1.0) else { continue };
+            // Revolutions that are measured one after the other may meet the same beams, and leave those next to them empty.
+            if arrays.ranges[beam] != NO_RETURN {
+                let other = (f64::from(arrays.angles[beam]) - first_angle) / scan.step;
+                let next = beam_of(if slot > other { slot.round() + 1.0 } else { slot.round() - 1.0 });
+                beam = next.filter(|next| arrays.ranges[*next] == NO_RETURN).unwrap_or(beam);
+            }
+            if range < f64::from(arrays.ranges[beam]) {
+                (arrays.ranges[beam], arrays.angles[beam]) = (range as u16, angle as f32);
+            }
+        }
+        Scan::of_words(&self.words)
+    }
+}
+
 /// Returns the times of the first and the last beam, in seconds after the stamp of `scan`.
 pub(crate) fn times(scan: &Scan) -> [f64; 2] {
     let last = scan.beams().saturating_sub(1);
@@ -85,6 +212,13 @@ pub(crate) fn times(scan: &Scan) -> [f64; 2] {
     [scan.beam_ns(0), latest].map(|time| 1e-9 * time as f64)
 }
 
+/// Returns whether the last of `beams` beams, `step` radians apart, is a neighbor of the first one.
+pub(crate) fn is_whole(beams: usize, step: f64) -> bool {
+    beams as f64 + 1.5 >= TAU / step.abs()
+}
+
+/// Value of a beam without a reading in an undistorted scan.
+const NO_RETURN: u16 = u16::MAX;
 /// Half the turn of a step below which an arc equals its chord.
 const STRAIGHT_RAD: f64 = 1e-6;
 /// Part of the way to the measured velocity, per scan.

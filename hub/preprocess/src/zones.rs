@@ -111,7 +111,7 @@ impl Check {
     /// of a table.
     pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
         let layout = Layout::of(scan, self.table.most());
-        if self.table.layout() != layout {
+        if self.table.layout != layout {
             self.table.make(layout);
             self.forget();
         }
@@ -120,13 +120,13 @@ impl Check {
         let invalid = self.table.invalid(ranges, scan.spacing);
         let Met { inside, nearest } = self.table.met(ranges, scan.exact_angles());
         let is_enough = self.seen >= self.min_scans && !self.is_blind();
-        let is_valid = invalid <= self.table.most_invalid();
+        let is_valid = invalid <= self.table.most_invalid;
         let is_known = is_enough && !self.is_late && is_valid;
-        for (streak, &beams) in self.streaks.iter_mut().zip(&inside).take(self.table.circles()) {
+        for (streak, &beams) in self.streaks.iter_mut().zip(&inside).take(self.table.circles) {
             *streak = if beams >= self.min_beams { streak.saturating_add(1) } else { 0 };
         }
         out.verdict = self.verdict(is_known) as u8;
-        out.count = self.table.circles() as u8;
+        out.count = self.table.circles as u8;
         (out.nearest_beam, out.nearest_mm) = nearest.unwrap_or((Zones::NO_BEAM, Zones::NO_DISTANCE));
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
@@ -141,7 +141,7 @@ impl Check {
     /// replace one of them. Returns the zone that the scan violates if no more points arrive, or `None`. Before the
     /// first complete scan, the result is `None`.
     pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16], angles: &[f32]) -> Option<Warning> {
-        if !self.table.layout().is_of(count, unit_um) || self.is_blind() {
+        if !self.table.layout.is_of(count, unit_um) || self.is_blind() {
             return None;
         }
         let ranges = &ranges[..ranges.len().min(count).min(self.table.most())];
@@ -149,7 +149,7 @@ impl Check {
         let will_be = |zone: &usize| {
             inside[*zone] >= self.min_beams && self.streaks[*zone].saturating_add(1) >= self.min_scans
         };
-        let smallest = self.table.circles().checked_sub(1)?;
+        let smallest = self.table.circles.checked_sub(1)?;
         let zone = (0..=smallest).rev().find(will_be)?;
         let verdict = if zone == smallest { Verdict::Stop } else { Verdict::Slow };
         let (beam, distance_mm) = nearest?;
@@ -160,7 +160,7 @@ impl Check {
     /// afterwards.
     pub fn stale(&mut self, out: &mut Zones) {
         self.forget();
-        *out = Zones { count: self.table.circles() as u8, ..Zones::unknown() };
+        *out = Zones { count: self.table.circles as u8, ..Zones::unknown() };
         self.write_circles(&[0; ZONES], out);
     }
 
@@ -172,7 +172,7 @@ impl Check {
 
     /// Returns the number of relevant beams of the last scan's layout; 0 before the first scan.
     pub fn telling(&self) -> u16 {
-        self.table.telling()
+        self.table.telling
     }
 
     /// Returns whether fewer beams are relevant than a violation takes. The verdict is then always unknown.
@@ -191,7 +191,7 @@ impl Check {
 
     /// Returns the verdict. Points inside the smallest circle take precedence over invalid beams.
     fn verdict(&self, is_known: bool) -> Verdict {
-        match self.table.circles().checked_sub(1) {
+        match self.table.circles.checked_sub(1) {
             None => Verdict::Unknown,
             Some(smallest) if self.is_violated(smallest) => Verdict::Stop,
             _ if !is_known => Verdict::Unknown,
@@ -205,7 +205,7 @@ impl Check {
         out.reserved = 0;
         for (zone, circle) in out.zone_array.iter_mut().enumerate() {
             *circle = Zone {
-                radius_mm: self.table.radius_mm(zone),
+                radius_mm: self.table.radii_mm[zone],
                 beams: beams[zone],
                 violated: u8::from(self.is_violated(zone)),
                 reserved: [0; 3],
@@ -248,7 +248,9 @@ impl Layout {
 /// The circles of a sensor, computed for the layout of its last scan.
 struct Table {
     pose: Pose,
+    /// Number of circles, at most [`ZONES`].
     circles: usize,
+    /// Radii of the circles; 0 for unused ones.
     radii_mm: [u16; ZONES],
     /// The robot's own body: the sectors, and their number.
     sectors: ([Sector; SECTORS], usize),
@@ -265,6 +267,7 @@ struct Table {
     tells: Box<[u16]>,
     /// Number of relevant beams.
     telling: u16,
+    /// Maximum number of invalid beams with which the verdict does not become unknown.
     most_invalid: u16,
 }
 
@@ -307,24 +310,9 @@ impl Table {
         table
     }
 
-    /// Returns the number of circles, at most [`ZONES`].
-    fn circles(&self) -> usize {
-        self.circles
-    }
-
-    /// Returns the radius of circle `zone`; 0 for unused ones.
-    fn radius_mm(&self, zone: usize) -> u16 {
-        self.radii_mm[zone]
-    }
-
     /// Returns the maximum number of beams of a scan.
     fn most(&self) -> usize {
         self.tells.len()
-    }
-
-    /// Returns the layout of the table.
-    fn layout(&self) -> Layout {
-        self.layout
     }
 
     /// Computes the table for `layout`.
@@ -375,16 +363,6 @@ impl Table {
         let (lo_mm, hi_mm) = self.chord_mm(beam.q, sx * sx + sy * sy, f64::from(self.radii_mm[zone]));
         let from = if self.exact && lo_mm > 0 { floor(lo_mm as f64 / unit_mm) as u64 + 1 } else { 0 };
         (from.max(beam.own), in_units(hi_mm as f64, unit_mm))
-    }
-
-    /// Returns the number of relevant beams.
-    fn telling(&self) -> u16 {
-        self.telling
-    }
-
-    /// Returns the maximum number of invalid beams with which the verdict does not become unknown.
-    fn most_invalid(&self) -> u16 {
-        self.most_invalid
     }
 
     /// Returns the number of relevant beams without a reading. A beam that was not measured counts if nothing was

@@ -7,7 +7,8 @@ use std::f64::consts::FRAC_PI_2;
 use scanhub_schema::{Background, Motion, Pose, Scan};
 
 use super::{Class, INVALID, Limits, Runs};
-use crate::velocity::Velocity;
+use crate::directions::exact_angle;
+use crate::velocity::{Rigid, Velocity};
 
 /// State of the method that follows the robot.
 #[derive(Clone)]
@@ -43,10 +44,10 @@ struct Cell {
 /// Where the sensor is in the map, and where it looks.
 #[derive(Clone, Copy)]
 struct Place {
+    robot: Rigid,
+    /// Position of the sensor.
     x: f64,
     y: f64,
-    cos: f64,
-    sin: f64,
     pose: Pose,
     /// Velocity of the sensor.
     velocity: Velocity,
@@ -90,13 +91,12 @@ impl Moving {
     /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at `pose`.
     /// Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
     pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
-        let (sin, cos) = motion.yaw_rad.sin_cos();
-        let x = motion.x_m + cos * pose.x_m - sin * pose.y_m;
-        let y = motion.y_m + sin * pose.x_m + cos * pose.y_m;
+        let robot = Rigid::new(motion.x_m, motion.y_m, motion.yaw_rad);
+        let (x, y) = robot.point((pose.x_m, pose.y_m));
         let is_known = motion.has_pose() && x.abs() < FARTHEST_M && y.abs() < FARTHEST_M;
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         let velocity = velocity.of_sensor(pose);
-        self.place = is_known.then_some(Place { x, y, cos, sin, pose: *pose, velocity, angles, unit_m });
+        self.place = is_known.then_some(Place { robot, x, y, pose: *pose, velocity, angles, unit_m });
         // Along a corridor every place looks alike.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
         let is_sure = motion.is_degenerate() || variance <= UNSURE_M * UNSURE_M;
@@ -127,8 +127,7 @@ impl Moving {
                 *class = if reading == INVALID { Class::Invalid } else { Class::Unknown };
                 continue;
             }
-            let angle = exact.get(i).filter(|exact| exact.is_finite()).map(|&exact| f64::from(exact));
-            let angle = angle.unwrap_or(place.angles.0 + i as f64 * place.angles.1);
+            let angle = exact_angle(exact, i).unwrap_or(place.angles.0 + i as f64 * place.angles.1);
             let range = f64::from(reading) * place.unit_m;
             // The sensor moves while a scan is measured.
             let (x, y, yaw) = place.velocity.position(1e-9 * scan.beam_ns(i) as f64);
@@ -305,8 +304,7 @@ impl Cell {
 impl Place {
     /// Where a beam at the sensor's `angle` points in the map.
     fn along(&self, angle: f64) -> (f64, f64) {
-        let (x, y) = self.pose.direction(angle);
-        (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
+        self.robot.turned(self.pose.direction(angle))
     }
 }
 

@@ -186,21 +186,26 @@ impl Sums {
         let Line { a, b } = self.line();
         (self.square - a * self.c - b * self.s).max(0.0)
     }
+
+    #[inline]
+    fn combined(self, other: Sums, combine: impl Fn(f64, f64) -> f64) -> Sums {
+        Sums {
+            cc: combine(self.cc, other.cc),
+            cs: combine(self.cs, other.cs),
+            ss: combine(self.ss, other.ss),
+            c: combine(self.c, other.c),
+            s: combine(self.s, other.s),
+            square: combine(self.square, other.square),
+            count: combine(self.count, other.count),
+        }
+    }
 }
 
 impl std::ops::Add for Sums {
     type Output = Sums;
 
     fn add(self, other: Sums) -> Sums {
-        Sums {
-            cc: self.cc + other.cc,
-            cs: self.cs + other.cs,
-            ss: self.ss + other.ss,
-            c: self.c + other.c,
-            s: self.s + other.s,
-            square: self.square + other.square,
-            count: self.count + other.count,
-        }
+        self.combined(other, |one, other| one + other)
     }
 }
 
@@ -208,14 +213,6 @@ impl std::ops::Sub for Sums {
     type Output = Sums;
 
     fn sub(self, other: Sums) -> Sums {
-        Sums {
-            cc: self.cc - other.cc,
-            cs: self.cs - other.cs,
-            ss: self.ss - other.ss,
-            c: self.c - other.c,
-            s: self.s - other.s,
-            square: self.square - other.square,
-            count: self.count - other.count,
-        }
+        self.combined(other, |one, other| one - other)
     }
 }

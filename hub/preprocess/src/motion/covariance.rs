@@ -1,65 +1,8 @@
-//! Geometry of the plane for motion: rigid transforms, and symmetric 3 x 3 matrices such as their covariances.
+//! Covariances of positions and steps: symmetric 3 x 3 matrices, and what transforms do with them.
 
-use std::f64::consts::{PI, TAU};
+use crate::velocity::Rigid;
 
-/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform from the
-/// frame of a robot there into that frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rigid {
-    /// Ahead.
-    pub x: f64,
-    /// To the left.
-    pub y: f64,
-    /// Direction.
-    pub yaw: f64,
-    cos: f64,
-    sin: f64,
-}
-
-impl Default for Rigid {
-    fn default() -> Self {
-        Rigid { x: 0.0, y: 0.0, yaw: 0.0, cos: 1.0, sin: 0.0 }
-    }
-}
-
-impl Rigid {
-    /// Creates the transform of position `x`, `y` and direction `yaw`.
-    pub fn new(x: f64, y: f64, yaw: f64) -> Rigid {
-        let (sin, cos) = yaw.sin_cos();
-        Rigid { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
-    }
-
-    /// Returns this transform followed by `next`, which is given in the frame of this one.
-    pub fn then(&self, next: &Rigid) -> Rigid {
-        let (x, y) = self.point((next.x, next.y));
-        Rigid::new(x, y, self.yaw + next.yaw)
-    }
-
-    /// Returns the inverse transform.
-    pub fn inverse(&self) -> Rigid {
-        let (x, y) = self.turned_back((-self.x, -self.y));
-        Rigid::new(x, y, -self.yaw)
-    }
-
-    /// Transforms a point out of this frame.
-    #[inline]
-    pub fn point(&self, (x, y): (f64, f64)) -> (f64, f64) {
-        (self.x + self.cos * x - self.sin * y, self.y + self.sin * x + self.cos * y)
-    }
-
-    /// Transforms a direction out of this frame.
-    #[inline]
-    pub(super) fn turned(&self, (x, y): (f64, f64)) -> (f64, f64) {
-        (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
-    }
-
-    /// Transforms a direction into this frame.
-    pub(super) fn turned_back(&self, (x, y): (f64, f64)) -> (f64, f64) {
-        (self.cos * x + self.sin * y, self.cos * y - self.sin * x)
-    }
-}
-
-/// Three rows.
+/// A matrix as three rows.
 pub(super) type Square = [[f64; 3]; 3];
 
 /// Adds factor v v' to `m`.
@@ -83,7 +26,7 @@ pub(super) fn around(a: &Square, b: &Square) -> Square {
     product(&product(a, b), &transposed)
 }
 
-/// The eigenvalues of a symmetric matrix, and for each its unit vector: by Jacobi's rotations.
+/// Returns the eigenvalues of a symmetric matrix, and the unit vector of each, by Jacobi's rotations.
 pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     let mut vectors = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     for _ in 0..SWEEPS {
@@ -108,12 +51,12 @@ pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
     ([m[0][0], m[1][1], m[2][2]], vectors)
 }
 
-/// The covariance of `step` between two places in one frame, `before` and the next, of which each is unsure for itself: `own`
-/// of the next one, `of_before`.
+/// Returns the covariance of `step`, which leads from `before` to another position in the same frame. The errors of both
+/// positions are independent: `of_before` and `own`.
 pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &Rigid) -> Square {
     let (x, y) = (before.turned_back((1.0, 0.0)), before.turned_back((0.0, 1.0)));
     let back = [[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]];
-    // How the step changes with the place before.
+    // Derivatives of the step by the position before it.
     let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
     let (own, other) = (around(&back, own), around(&by_before, of_before));
     std::array::from_fn(|i| std::array::from_fn(|j| own[i][j] + other[i][j]))
@@ -139,7 +82,7 @@ pub(super) fn rows(m: &Square) -> [f32; 9] {
     std::array::from_fn(|i| m[i / 3][i % 3] as f32)
 }
 
-/// Enough for all digits of three numbers.
+/// Number of sweeps after which all digits of three eigenvalues are right.
 const SWEEPS: usize = 6;
 
 #[cfg(test)]

@@ -1,0 +1,55 @@
+//! Directions of a scan's beams.
+
+use scanhub_schema::{Pose, Scan};
+
+/// Directions of the beams of one sensor in the robot's frame, as unit vectors.
+pub(crate) struct Directions {
+    /// Pose of the sensor, first angle and step of the scans that the grid is for.
+    layout: Option<(Pose, f64, f64)>,
+    grid: Box<[(f64, f64)]>,
+}
+
+impl Directions {
+    /// Allocates the directions of at most `beams` beams.
+    pub(crate) fn new(beams: usize) -> Directions {
+        Directions { layout: None, grid: vec![(0.0, 0.0); beams].into() }
+    }
+
+    /// Adapts the directions to scans such as `scan`, of a sensor at `pose`. Returns whether they have changed.
+    pub(crate) fn fit(&mut self, pose: &Pose, scan: &Scan) -> bool {
+        let layout = Some((*pose, scan.first_angle, scan.step));
+        if self.layout == layout {
+            return false;
+        }
+        self.layout = layout;
+        for (i, direction) in self.grid.iter_mut().enumerate() {
+            *direction = pose.direction(scan.first_angle + i as f64 * scan.step);
+        }
+        true
+    }
+
+    /// Returns the direction of beam `i` on the grid, and `None` after the last beam.
+    pub(crate) fn on_grid(&self, i: usize) -> Option<(f64, f64)> {
+        self.grid.get(i).copied()
+    }
+
+    /// Returns the readings of `scan` in the order of the beams, except those of 0: beam, direction, and range in meters.
+    pub(crate) fn readings<'a>(
+        &'a self,
+        pose: &'a Pose,
+        scan: &'a Scan,
+    ) -> impl Iterator<Item = (usize, (f64, f64), f64)> + 'a {
+        let unit_m = f64::from(scan.unit_um) * 1e-6;
+        let exact = scan.exact_angles();
+        self.grid.iter().enumerate().take(scan.beams()).filter_map(move |(i, &on_grid)| {
+            let range = scan.range(i).map_or(0.0, |range| f64::from(range) * unit_m);
+            let direction = || exact_angle(exact, i).map_or(on_grid, |exact| pose.direction(exact));
+            (range > 0.0).then(|| (i, direction(), range))
+        })
+    }
+}
+
+/// Returns the exact angle of beam `i` in radians, if `exact` has one.
+pub(crate) fn exact_angle(exact: &[f32], i: usize) -> Option<f64> {
+    exact.get(i).filter(|angle| angle.is_finite()).map(|&angle| f64::from(angle))
+}
