@@ -2,6 +2,8 @@
 //! each loan: one small piece, which is freed when the sample is sent. Telegrams, marks and foreground without a subscriber
 //! need no loan.
 
+#![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
+
 mod counting;
 
 use std::fs;

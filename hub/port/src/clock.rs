@@ -1,5 +1,7 @@
 //! The only place in the hub that reads the clock.
 
+#![expect(clippy::disallowed_methods, reason = "the clock of the hub")]
+
 use rustix::event::Timespec;
 use rustix::time::{ClockId, clock_gettime};
 use scanhub_schema::Nanos;

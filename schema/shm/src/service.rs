@@ -104,6 +104,7 @@ pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
 
 /// Calls `make` until the service exists, for at most two seconds. A service that its last user is leaving can be
 /// created again soon.
+#[expect(clippy::disallowed_methods, reason = "waits for a service that another process has half created")]
 pub(crate) fn create<T>(
     node: &Node,
     service: &ServiceName,

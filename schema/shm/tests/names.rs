@@ -1,5 +1,7 @@
 //! The names of a domain's shared memory, and the bells that lie under them.
 
+#![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
+
 mod place;
 
 use std::path::PathBuf;

@@ -1,19 +1,10 @@
-//! What may stand in which source: clocks, unsafe code, shared memory, the sensor's EEPROM, the shape of a file.
+//! What may stand in which source: unsafe code, shared memory, the sensor's EEPROM, the shape of a file.
 
 use super::tree::{Tree, code, find};
 
-/// Integration tests and benches may look at a clock and do as they like with telegrams.
+/// Integration tests and benches may do as they like with telegrams.
 fn is_test(path: &str) -> bool {
     path.starts_with("tests/") || path.starts_with("benches/") || path.contains("/tests/")
-}
-
-pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
-    // The last one waits for a service that another process has half created.
-    const ALLOWED: [&str; 5] =
-        ["clients/", "hub/port/src/clock.rs", "hub/sim/src/port.rs", "hub/demo", "schema/shm/src/service.rs"];
-    find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
-        !is_test(path) && !ALLOWED.iter().any(|allowed| path.starts_with(allowed))
-    })
 }
 
 /// Files that may hold unsafe code, each for something that no safe crate offers.

@@ -3,20 +3,6 @@
 use super::{holds, sources, written};
 
 #[test]
-fn clocks_are_read_in_few_places() {
-    holds(sources::clocks_are_read_in_few_places, |tree| {
-        vec![
-            tree.with("hub/daemon/src/link.rs", "//! A link.\nlet now = std::time::Instant::now();\n"),
-            tree.with("hub/sim/src/room.rs", "//! A room.\nlet now = SystemTime::now();\n"),
-            tree.with(
-                "hub/drivers/src/lms/session.rs",
-                "//! A session.\nlet now = rustix::time::clock_gettime(id);\n",
-            ),
-        ]
-    });
-}
-
-#[test]
 fn tests_do_not_depend_on_time() {
     holds(sources::tests_do_not_depend_on_time, |tree| {
         vec![

@@ -1,6 +1,8 @@
 //! The verb on real ptys: a host opens the port, asks, and reads; what it got is compared with the truth. Every wait
 //! is for something, with a deadline far beyond what it takes.
 
+#![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
+
 mod head;
 mod host;
 mod server;

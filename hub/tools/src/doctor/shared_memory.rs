@@ -260,6 +260,7 @@ mod tests {
 
     /// Waits until no process has `path` open. A child that another test starts has a copy of all descriptors for a
     /// moment.
+    #[expect(clippy::disallowed_methods, reason = "a limit of real time")]
     fn await_unheld(prefix: &str, user: u32, path: &Path) {
         let give_up_at = Instant::now() + Duration::from_secs(60);
         while !unheld(prefix, user).iter().any(|file| file.path == path) {
