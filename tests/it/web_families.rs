@@ -8,7 +8,7 @@ use crate::testkit::{INT, Sender, TestEnv, in_a_network, number, until};
 use crate::web::web;
 use crate::web_page::browse;
 use scanhub_schema::{Contents, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
-use scanhub_viewer::scene::{Place, Scene};
+use scanhub_viewer::scene::{PointerPosition, Scene};
 
 /// A hall that is as no mirror shows it.
 const HALL: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
@@ -139,7 +139,7 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
             page.mouse("mouseMoved", pixels, false);
             let at_m = pair(&page.ask(&format!("scanhub.place({}, {})", pixels.0, pixels.1)));
             let within_m = 14.0 / page.ask("scanhub.view.scale").as_f64().expect("pixels for a metre");
-            let words = Place::of(scene.sensors.iter(), at_m, within_m).words();
+            let words = PointerPosition::of(scene.sensors.iter(), at_m, within_m).words();
             let (lines, last) = words.split_at(words.len().min(3));
             let last: String = last.iter().map(|word| format!(", {word}")).collect();
             let text = lines.join("\\n") + &last;

@@ -1,5 +1,4 @@
-//! The people of a tracker: where they are and how surely, in which room, and the tails of where they were. Time is an argument.
-//! Refuses to know what tracks them.
+//! People of a tracker: position and its uncertainty, room, and positions of the last seconds. Time is an argument.
 
 use std::collections::VecDeque;
 
@@ -9,41 +8,41 @@ use scanhub_schema::{Track, TrackState, Tracks};
 #[derive(Clone, Debug, Default)]
 pub struct People {
     persons: Vec<Person>,
-    /// When nothing was heard for too long, in ns of CLOCK_MONOTONIC.
+    /// Time from which on the last sample is too old, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
 }
 
-/// One of them.
+/// One person.
 #[derive(Clone, Debug)]
 pub struct Person {
-    /// The person's number.
+    /// ID of the track.
     pub id: u64,
-    /// How well the person is known.
+    /// State of the track.
     pub state: TrackState,
-    /// Where: metres in the map of the site.
-    pub place: (f64, f64),
-    /// Where else the person may be.
+    /// Position in the map of the site, in meters.
+    pub position: (f64, f64),
+    /// Uncertainty of the position.
     pub reach: Ellipse,
-    /// The room, if it is one of the site's.
+    /// Name of the room, if the person is in one.
     pub room: Option<String>,
-    /// When, in ns of CLOCK_MONOTONIC, and where the person was, the oldest first.
+    /// Times in ns of CLOCK_MONOTONIC and positions of the last seconds, the oldest first.
     tail: VecDeque<(u64, (f64, f64))>,
 }
 
-/// An ellipse around a place that holds the true one in 95 of 100 cases.
+/// An ellipse around a position that contains the true one in 95 of 100 cases.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ellipse {
-    /// Half of its longer axis, in metres.
+    /// Half of the longer axis, in meters.
     pub long_m: f64,
-    /// Half of its shorter axis, in metres.
+    /// Half of the shorter axis, in meters.
     pub short_m: f64,
-    /// Where the longer one points, in radians counter-clockwise from x.
+    /// Direction of the longer axis, in radians counterclockwise from x.
     pub yaw_rad: f64,
 }
 
 impl Ellipse {
-    /// Of a normal distribution with this covariance in m2: xx, xy, yy. Its axes are the eigenvectors, as long as the roots of
-    /// the eigenvalues times that of the 95 % quantile of chi-squared with two degrees of freedom.
+    /// Computes the ellipse of a normal distribution with this covariance in m2: xx, xy, yy. The axes are the eigenvectors. Their
+    /// length is the root of the eigenvalue times the 95 % quantile of chi-squared with two degrees of freedom.
     pub fn of(covariance: [f32; 3]) -> Ellipse {
         let [xx, xy, yy] = covariance.map(f64::from);
         let (mean, half) = ((xx + yy) / 2.0, ((xx - yy) / 2.0).hypot(xy));
@@ -54,7 +53,7 @@ impl Ellipse {
 }
 
 impl Person {
-    /// Returns whether this is more than perhaps a person.
+    /// Returns whether the track is not tentative.
     pub fn is_known(&self) -> bool {
         self.state != TrackState::Tentative
     }
@@ -64,16 +63,16 @@ impl Person {
         self.state == TrackState::Confirmed
     }
 
-    /// Where the person was over the last seconds, the oldest first.
+    /// Returns the positions of the last seconds, the oldest first.
     pub fn tail(&self) -> impl Iterator<Item = (f64, f64)> {
-        self.tail.iter().map(|(_, place)| *place)
+        self.tail.iter().map(|(_, position)| *position)
     }
 
     fn of(track: &Track, tail: VecDeque<(u64, (f64, f64))>) -> Person {
         Person {
             id: track.id,
             state: track.state(),
-            place: (track.x_m.into(), track.y_m.into()),
+            position: (track.x_m.into(), track.y_m.into()),
             reach: Ellipse::of(track.covariance),
             room: track.room_name().map(str::to_owned),
             tail,
@@ -82,7 +81,7 @@ impl Person {
 }
 
 impl People {
-    /// Takes where they are, which arrived at `now_ns`.
+    /// Takes a sample that arrived at `now_ns`.
     pub(crate) fn take(&mut self, tracks: &Tracks, now_ns: u64) {
         let mut before = std::mem::take(&mut self.persons);
         self.persons = tracks
@@ -92,17 +91,17 @@ impl People {
                 let known = before.iter().position(|person| person.id == track.id);
                 let mut person =
                     Person::of(track, known.map(|at| before.swap_remove(at).tail).unwrap_or_default());
-                if person.tail.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_NS) {
-                    person.tail.push_back((now_ns, person.place));
+                if person.tail.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_INTERVAL_NS) {
+                    person.tail.push_back((now_ns, person.position));
                 }
                 person
             })
             .collect();
-        self.old_at_ns = now_ns + OLD_NS;
+        self.old_at_ns = now_ns + MAX_AGE_NS;
         self.age(now_ns);
     }
 
-    /// Forgets what is too long ago at `now_ns`; whether there was such.
+    /// Deletes positions and people that are too old at `now_ns`. Returns whether there were any.
     pub(crate) fn age(&mut self, now_ns: u64) -> bool {
         let steps =
             |people: &People| people.persons.iter().map(|person| person.tail.len() + 1).sum::<usize>();
@@ -116,19 +115,19 @@ impl People {
         before != steps(self)
     }
 
-    /// Who is there.
+    /// Returns all people, even tentative ones.
     pub fn persons(&self) -> &[Person] {
         &self.persons
     }
 
-    /// Those of them who are more than perhaps persons.
+    /// Returns the people whose track is not tentative.
     pub fn known(&self) -> impl Iterator<Item = &Person> {
         self.persons.iter().filter(|person| person.is_known())
     }
 }
 
-/// How many of `people` are in which room, in words, the rooms by their names and those in none at the end; nothing if there
-/// is nobody.
+/// Returns the number of people in each room as text, sorted by name, with those outside all rooms at the end. `None` if there
+/// are no people.
 pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
     let mut rooms: Vec<_> = people.map(|person| person.room.as_deref()).collect();
     rooms.sort_by_key(|room| (room.is_none(), *room));
@@ -140,12 +139,12 @@ pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
     (count > 0).then(|| format!("{count} {persons}: {}", words.join(", ")))
 }
 
-/// Between two steps of a tail.
-const STEP_NS: u64 = 150_000_000;
-/// Of a whole tail.
+/// Minimum interval between two positions of a tail.
+const STEP_INTERVAL_NS: u64 = 150_000_000;
+/// Duration of a tail.
 const TAIL_NS: u64 = 5_000_000_000;
-/// A tracker that says nothing for so long knows nothing.
-const OLD_NS: u64 = 1_000_000_000;
+/// Maximum age of the last sample of a tracker.
+const MAX_AGE_NS: u64 = 1_000_000_000;
 /// -2 ln 0.05.
 const CHI_SQUARED_95: f64 = 5.991_464_547_107_979;
 
@@ -161,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tail_goes_with_its_number_and_has_an_end() {
+    fn tail_follows_the_id_and_ends() {
         let mut people = People::default();
         for n in 0..300 {
             let x_m = n as f32 / 100.0;
@@ -175,12 +174,12 @@ mod tests {
         assert!(tail.len() > 25 && tail.len() < 36 && tail.is_sorted(), "{tail:?}");
         assert!(people.persons()[0].is_known());
         let last_ns = 299 * 40_000_000;
-        assert!(!people.age(last_ns + 1) && people.age(last_ns + OLD_NS));
+        assert!(!people.age(last_ns + 1) && people.age(last_ns + MAX_AGE_NS));
         assert!(people.persons().is_empty());
     }
 
     #[test]
-    fn where_else_somebody_may_be_is_an_ellipse() {
+    fn ellipse_has_the_axes_of_the_covariance() {
         let near = |a: f64, b: f64| (a - b).abs() < 1e-6;
         let along = Ellipse::of([0.25, 0.0, 0.01]);
         assert!(near(along.long_m, 0.5 * CHI_SQUARED_95.sqrt()) && near(along.short_m, 0.2 * along.long_m));
@@ -193,7 +192,7 @@ mod tests {
             [0.25 * cos * cos + 0.01 * sin * sin, 0.24 * sin * cos, 0.25 * sin * sin + 0.01 * cos * cos];
         let turned = Ellipse::of(turned.map(|value| value as f32));
         assert!(near(turned.yaw_rad.to_degrees(), 30.0) && near(turned.short_m, along.short_m), "{turned:?}");
-        // What no distribution has is a point, not nonsense.
+        // An invalid covariance gives a point.
         assert_eq!(Ellipse::of([-1.0, 0.0, -1.0]).long_m, 0.0);
     }
 

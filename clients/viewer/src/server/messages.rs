@@ -5,7 +5,7 @@ mod replay;
 mod scene_update;
 mod tilt;
 
-use crate::scene::{Scene, Sensor, Trouble, rooms};
+use crate::scene::{Problem, Scene, Sensor, rooms};
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
 use scanhub_schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
 use serde::Serialize;
@@ -78,7 +78,7 @@ pub fn status_channel(sensor: &str) -> Channel {
 
 /// The verdict of the robot's sensors, whether they are shown in a map, how its hub is, and how many people are in which room, in
 /// words; `trouble` is why there is no hub.
-pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> {
+pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Problem>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
         verdict: &'a str,
@@ -164,7 +164,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
     };
     let status = sensor.status.as_ref();
     let ages = sensor.meter.age_percentiles_ms();
-    let trouble = sensor.trouble();
+    let trouble = sensor.problem();
     bytes(&Told {
         name: &sensor.name,
         state: sensor.state(),
@@ -172,7 +172,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         model: status.and_then(|status| status.model()),
         port: status.map(|status| status.port()).filter(|port| !port.is_empty()),
         remote: is_remote(&sensor.name),
-        pose: sensor.mount.pose().map(place),
+        pose: sensor.placement.pose().map(place),
         hz: sensor.meter.hz(),
         lost: sensor.lost,
         lost_on_line: status.and_then(|status| status.lost_on_line()),
@@ -220,7 +220,7 @@ const BEYOND: u16 = u16::MAX - 1;
 
 /// Where the sensors of `scene` sit, as far as that was told.
 pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
-    let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.mount.pose()?));
+    let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.placement.pose()?));
     let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
     let mut message = Vec::new();
     scanhub_ros::static_transforms(&mut message, wall_ns, &poses);
@@ -234,7 +234,7 @@ struct Words<'a> {
 }
 
 impl Words<'_> {
-    fn of(trouble: &Trouble) -> Words<'_> {
+    fn of(trouble: &Problem) -> Words<'_> {
         Words { what: &trouble.what, remedy: &trouble.remedy }
     }
 }

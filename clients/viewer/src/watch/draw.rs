@@ -12,7 +12,7 @@ use scanhub_schema::Counter;
 use super::counters::page;
 use super::map::{DOTS, colour, map};
 use super::view::View;
-use crate::scene::{Place, Scene, Sensor, rooms, verdict};
+use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
@@ -188,7 +188,7 @@ fn measure(dot_m: f64) -> String {
 fn words(scene: &Scene, view: &View, room: usize) -> String {
     let Some(at) = view.pointer_m else { return String::new() };
     let shown = view.shown(scene);
-    let place = Place::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
+    let place = PointerPosition::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
     let mut words = String::new();
     for part in place.words() {
         let between = if words.is_empty() { "" } else { ", " };

@@ -129,7 +129,7 @@ impl Layers {
             if view.trails {
                 layers.tails.extend(person.tail().map(turned));
             }
-            let (x, y) = turned(person.place);
+            let (x, y) = turned(person.position);
             let number = format!("#{}", person.id);
             layers.people.push((x, y, if person.is_seen() { number } else { format!("({number})") }));
         }
@@ -155,7 +155,7 @@ impl Layers {
                 let corners = found.corners().iter().map(|corner| (corner.x_m.into(), corner.y_m.into()));
                 layers.corners.extend(corners.map(turned));
             }
-            if let Some(pose) = sensor.mount.pose() {
+            if let Some(pose) = sensor.placement.pose() {
                 let (x, y) = turned((pose.x_m, pose.y_m));
                 layers.sensors.push((x, y, (number + 1).to_string()));
             }

@@ -4,7 +4,7 @@ use std::rc::Rc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use crate::scene::{Circle, People, Scene, Trouble, circles};
+use crate::scene::{Circle, People, Problem, Scene, circles};
 use crate::server::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
@@ -58,7 +58,7 @@ pub(super) struct Feeder<'a> {
     status_at: Instant,
     /// Before that it is not told again that something is short.
     short_at: Instant,
-    trouble: Option<Trouble>,
+    trouble: Option<Problem>,
     message: Vec<u8>,
 }
 
@@ -238,10 +238,10 @@ impl<'a> Feeder<'a> {
                     "on that machine: scanhub gateway --interface NAME; here, scanhub listen shows who sends",
                 )),
             }
-            .map(|Failure { message, hint, .. }| Trouble { what: message, remedy: hint })
+            .map(|Failure { message, hint, .. }| Problem { what: message, remedy: hint })
         } else if self.scene.sensors.is_empty() {
             let remedy = "scanhub run --link front=/dev/ttyUSB0".to_owned();
-            Some(Trouble { what: "the hub has no sensors".to_owned(), remedy })
+            Some(Problem { what: "the hub has no sensors".to_owned(), remedy })
         } else {
             None
         };
@@ -268,14 +268,15 @@ impl Sink for Feeder<'_> {
             return Ok(());
         }
         if let Sample::Tracks(tracks) = sample {
-            let mounts = |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.mount).collect::<Vec<_>>();
+            let mounts =
+                |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.placement).collect::<Vec<_>>();
             let before = mounts(&self.scene);
             picture::take(&mut self.scene, name, sample);
             self.poses_are_new |= mounts(&self.scene) != before;
             self.put_tracks(&name.sensor, tracks.header().wall_ns);
             return Ok(());
         }
-        let mount = self.scene.sensor(&name.sensor).mount;
+        let mount = self.scene.sensor(&name.sensor).placement;
         picture::take(&mut self.scene, name, sample);
         let board = self.board;
         let mut message = std::mem::take(&mut self.message);
@@ -297,7 +298,7 @@ impl Sink for Feeder<'_> {
                 self.of(&name.sensor).put_background(board, &mut message, wall_ns, model);
             }
             Sample::Status(_) => {
-                self.poses_are_new |= mount != self.scene.sensor(&name.sensor).mount;
+                self.poses_are_new |= mount != self.scene.sensor(&name.sensor).placement;
                 self.status_at = Instant::now();
             }
             _ => {}

@@ -42,7 +42,7 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entity.tell("beam", point.beam.to_string());
         entity.tell("distance_m", format!("{:.3}", point.distance_m()));
         entity.tell("verdict", circle.verdict.name().to_owned());
-        let from = sensor.mount.pose().unwrap_or_default();
+        let from = sensor.placement.pose().unwrap_or_default();
         let points = [(from.x_m, from.y_m), (point.x_m, point.y_m)];
         let color = colour(circle.verdict, 1.0);
         entity.lines.push(LinePrimitive::new(LINE_STRIP, points.into_iter(), color));
@@ -55,7 +55,7 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 /// cases; in the robot's frame, which is the map of the site for who follows a tracker. Who is not seen is pale.
 pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
-        let (x, y) = person.place;
+        let (x, y) = person.position;
         let colour = Colour { a: if person.is_seen() { 1.0 } else { PALE }, ..PERSON };
         let mut entity = Entity::new(format!("person {}", person.id), wall_ns);
         entity.tell("id", person.id.to_string());

@@ -1,47 +1,52 @@
-//! What is under a pointer: a place, and if a point is near it, whose that is and what its beam measured. The words are the
-//! same in every picture.
+//! The position under the pointer: its coordinates, and the reading of the nearest point. The text is the same in every
+//! picture.
 
 use super::{Point, Sensor};
 
-/// A place that somebody points at.
+/// The position under the pointer.
 #[derive(Clone, Copy, Debug)]
-pub struct Place<'a> {
-    /// Metres ahead of the robot's centre; of the point that is read, if there is one.
+pub struct PointerPosition<'a> {
+    /// Meters ahead of the robot's center; those of the point if there is a reading.
     pub x_m: f64,
-    /// Metres to the left of it.
+    /// Meters to the left of the robot's center.
     pub y_m: f64,
-    /// What a beam measured there.
+    /// Reading of the nearest point, if one is near enough.
     pub reading: Option<Reading<'a>>,
 }
 
-/// A point that somebody points at.
+/// A point under the pointer.
 #[derive(Clone, Copy, Debug)]
 pub struct Reading<'a> {
-    /// Whose it is.
+    /// Sensor that measured the point.
     pub sensor: &'a Sensor,
     /// The point, in the robot's frame.
     pub point: Point,
-    /// Angle of its beam in the sensor's frame, in radians.
+    /// Angle of the beam in the sensor's frame, in radians.
     pub angle_rad: f64,
-    /// What that beam measured, in metres.
+    /// Range along the beam, in meters.
     pub range_m: f64,
 }
 
-impl<'a> Place<'a> {
-    /// What is at `at_m`, metres ahead and to the left: the nearest point of `sensors`, if one is within `within_m`.
-    pub fn of(sensors: impl Iterator<Item = &'a Sensor>, at_m: (f64, f64), within_m: f64) -> Place<'a> {
+impl<'a> PointerPosition<'a> {
+    /// Returns the position `at_m`, in meters ahead and to the left, or the nearest point of `sensors` if one is within
+    /// `within_m`.
+    pub fn of(
+        sensors: impl Iterator<Item = &'a Sensor>,
+        at_m: (f64, f64),
+        within_m: f64,
+    ) -> PointerPosition<'a> {
         let reading = nearest(sensors, at_m, within_m);
         let (x_m, y_m) = reading.map_or(at_m, |reading| (reading.point.x_m, reading.point.y_m));
-        Place { x_m, y_m, reading }
+        PointerPosition { x_m, y_m, reading }
     }
 
-    /// Its distance from the robot's centre in metres.
+    /// Returns the distance from the robot's center in meters.
     pub fn distance_m(&self) -> f64 {
         self.x_m.hypot(self.y_m)
     }
 
-    /// What to say about it, the most needed first: distance and coordinates, and of a point the sensor with angle and range,
-    /// and the intensity.
+    /// Returns the lines of text about the position, the most important first: distance, coordinates, and for a point the sensor
+    /// with angle and range, and the intensity.
     pub fn words(&self) -> Vec<String> {
         let mut words = vec![
             format!("{} m from the robot", fixed(self.distance_m(), 2)),
@@ -56,7 +61,7 @@ impl<'a> Place<'a> {
     }
 }
 
-/// `value` with so many digits behind the point; what rounds to nothing has no sign.
+/// Formats `value` with this number of decimals, and without the sign of a negative zero.
 fn fixed(value: f64, digits: usize) -> String {
     let text = format!("{value:.digits$}");
     match text.strip_prefix('-') {
@@ -86,7 +91,7 @@ mod tests {
     use scanhub_schema::{Header, Pose, Scan, ScanHead, Status};
 
     #[test]
-    fn the_nearest_point_is_read() {
+    fn reads_the_nearest_point() {
         let mut scene = Scene::default();
         for (name, x_m) in [("front", 0.0), ("ahead", 1.0)] {
             let sensor = scene.sensor(name);
@@ -95,7 +100,7 @@ mod tests {
             let scan = Scan::of(ScanHead::lms(3, -90_000, 90_000, 1, 13), &[2000, 4000, 2000]);
             sensor.take_scan(&Header::default(), &scan, 0);
         }
-        let read = |at_m| Place::of(scene.sensors.iter(), at_m, 0.5);
+        let read = |at_m| PointerPosition::of(scene.sensors.iter(), at_m, 0.5);
         let place = read((4.8, 0.1));
         let reading = place.reading.unwrap();
         assert_eq!((&reading.sensor.name[..], reading.point.beam, reading.range_m), ("ahead", 1, 4.0));
@@ -112,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn what_rounds_to_nothing_has_no_sign() {
+    fn negative_zero_has_no_sign() {
         assert_eq!([fixed(-0.004, 2), fixed(-0.006, 2), fixed(0.0, 3)], ["0.00", "-0.01", "0.000"]);
     }
 }
