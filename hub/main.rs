@@ -173,12 +173,18 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             scanhub_verbs::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
-        Verb::Track(track) => {
-            scanhub_verbs::track(&track.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
-        }
-        Verb::Tilt(tilt) => {
-            scanhub_verbs::tilt(&tilt.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
-        }
+        Verb::Track(track) => scanhub_perception::verbs::track(
+            &track.options(everywhere)?,
+            &mut out,
+            &mut io::stderr(),
+            &*interrupt()?,
+        ),
+        Verb::Tilt(tilt) => scanhub_perception::verbs::tilt(
+            &tilt.options(everywhere)?,
+            &mut out,
+            &mut io::stderr(),
+            &*interrupt()?,
+        ),
         Verb::Site(site) => site.run(everywhere.json),
         Verb::Leds(leds) => {
             scanhub_verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)

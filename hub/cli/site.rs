@@ -45,7 +45,7 @@ struct Checked {
 impl Site {
     pub(crate) fn run(&self, json: bool) -> Result<(), Failure> {
         let Order::Check { file, svg, force } = &self.order;
-        let site = scanhub_track::Site::read(file)?;
+        let site = scanhub_perception::track::Site::read(file)?;
         if let Some(out) = svg {
             output::write(out, site.svg().as_bytes(), *force)?;
         }

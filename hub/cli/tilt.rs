@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use clap::Args;
+use scanhub_perception::tilt::{Mount, Settings};
+use scanhub_perception::verbs::TiltOptions;
 use scanhub_schema::Failure;
-use scanhub_tilt::{Mount, Settings};
-use scanhub_verbs::{Bounds, TiltOptions, duration};
+use scanhub_verbs::{Bounds, duration};
 
 use super::Everywhere;
 

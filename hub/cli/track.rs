@@ -4,8 +4,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use scanhub_perception::verbs::TrackOptions;
 use scanhub_schema::Failure;
-use scanhub_verbs::{Bounds, TrackOptions, duration};
+use scanhub_verbs::{Bounds, duration};
 
 use super::Everywhere;
 
@@ -39,7 +40,7 @@ fn tracker(name: &str) -> Result<String, String> {
 impl Track {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<TrackOptions, Failure> {
         Ok(TrackOptions {
-            site: scanhub_track::Site::read(&self.site)?,
+            site: scanhub_perception::track::Site::read(&self.site)?,
             name: self.name.clone(),
             count: self.count.clone(),
             delay: self.delay,

@@ -1,8 +1,8 @@
 //! Who takes part in a demonstration: which sensors there are, of which families, where they sit, and what follows them. Refuses
 //! to know how they are started.
 
+use scanhub_perception::track::Site;
 use scanhub_schema::{Failure, Family, Kind};
-use scanhub_track::Site;
 
 /// A simulated sensor.
 #[derive(Clone, Debug)]

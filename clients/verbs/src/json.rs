@@ -17,9 +17,9 @@ use crate::names::TopicName;
 use crate::output::{End, Output};
 use crate::receive_stats::ReceiveStats;
 
-pub(crate) use people::*;
+pub use people::*;
 pub(crate) use processed::*;
-pub(crate) use tilted::*;
+pub use tilted::*;
 // A background model as a line is what a file of it is.
 pub(crate) use scanhub_schema::as_json as background;
 

@@ -26,9 +26,7 @@ mod receive_stats;
 mod record;
 pub mod selection;
 pub mod show;
-mod text;
-mod tilt;
-mod track;
+pub mod text;
 mod window;
 
 pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
@@ -44,5 +42,3 @@ pub use list::{ListOptions, list, list_domains};
 pub use mask::{MaskOptions, mask};
 #[cfg(feature = "record")]
 pub use record::{RecordLook, RecordOptions, Split, record};
-pub use tilt::{TiltOptions, tilt};
-pub use track::{TrackOptions, track};

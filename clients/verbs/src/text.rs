@@ -17,9 +17,9 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
-pub(crate) use people::*;
+pub use people::*;
 pub(crate) use processed::*;
-pub(crate) use tilted::*;
+pub use tilted::*;
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);

@@ -196,13 +196,22 @@ fn the_scene_only_computes() {
 }
 
 #[test]
-fn three_dimensions_only_compute() {
-    holds(crates::three_dimensions_only_compute, |tree| {
-        let (manifest, lib) = ("clients/tilt/Cargo.toml", "clients/tilt/src/lib.rs");
+fn perception_only_computes() {
+    holds(crates::perception_only_computes, |tree| {
+        let lib = "clients/perception/src/lib.rs";
+        let planted = |path: &str, code: &str| {
+            tree.with(&format!("clients/perception/src/{path}"), &format!("//! So.\n{code}\n"))
+        };
         vec![
-            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
             tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
-            tree.with("clients/tilt/src/planted.rs", "//! So.\nuse std::time::Instant;\n"),
+            planted("tilt/planted.rs", "use std::time::Instant;"),
+            planted("tilt.rs", "let now = scanhub_client::clock::now_ns();"),
+            planted("tilt/planted.rs", "use std::net::UdpSocket;"),
+            planted("track/planted.rs", "let text = std::fs::read_to_string(path);"),
+            planted("track/planted.rs", "use std::{fmt, fs};"),
+            planted("track/planted.rs", "use scanhub_files::regular;"),
+            planted("track.rs", "let worker = std::thread::spawn(work);"),
+            planted("track/planted.rs", "use crate::verbs::Track;"),
         ]
     });
 }

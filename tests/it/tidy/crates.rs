@@ -224,8 +224,8 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 }
 
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record, what computes people and points for the verbs that publish them. The viewer,
-/// the gateway and the listener stand on the verbs.
+/// words of ROS come with them where they record. The viewer, the gateway, the listener and the perception of people and points
+/// stand on the verbs.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 4] = [
         ("scanhub-client", &["scanhub-schema", "scanhub-shm"]),
@@ -235,15 +235,7 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
         ),
         (
             "scanhub-verbs",
-            &[
-                "scanhub-client",
-                "scanhub-files",
-                "scanhub-schema",
-                "scanhub-shm",
-                "scanhub-ros",
-                "scanhub-tilt",
-                "scanhub-track",
-            ],
+            &["scanhub-client", "scanhub-files", "scanhub-schema", "scanhub-shm", "scanhub-ros"],
         ),
         (
             "scanhub-viewer",
@@ -344,12 +336,36 @@ pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// Scans and angles become points by their stamps alone, so that a recording gives what was live.
-pub(crate) fn three_dimensions_only_compute(tree: &Tree) -> Vec<String> {
-    const OUTSIDE: [&str; 6] = ["Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
-    let mut breaches = built_of(tree, "scanhub-tilt", &["scanhub-schema"]);
-    breaches.extend(lacks(tree, "clients/tilt/src/lib.rs", &["#![forbid(unsafe_code)]"]));
-    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/tilt/src/")));
+/// Finds clocks, sockets, files and threads in the code that computes people and points. Time is an argument there, so a
+/// recording gives what was live.
+pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
+    const OUTSIDE: [&str; 17] = [
+        "Instant",
+        "SystemTime",
+        "std::env",
+        "std::fs",
+        "std::io",
+        "std::net",
+        "std::os",
+        "std::path",
+        "std::process",
+        "std::sync",
+        "std::thread",
+        "std::{",
+        "scanhub_client",
+        "scanhub_files",
+        "scanhub_shm",
+        "scanhub_verbs",
+        "crate::verbs",
+    ];
+    let mut breaches = lacks(tree, "clients/perception/src/lib.rs", &["#![forbid(unsafe_code)]"]);
+    for module in ["tilt", "track"] {
+        let (file, folder) =
+            (format!("clients/perception/src/{module}.rs"), format!("clients/perception/src/{module}/"));
+        let is_own = |path: &str| path == file || path.starts_with(&folder);
+        breaches.extend(find(tree, &OUTSIDE, is_own));
+        breaches.extend(find(tree, &["extern crate", "println!", "eprint", "clap", "rustix"], is_own));
+    }
     breaches
 }
 
@@ -444,9 +460,10 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
         open.extend(ours(&members[&name], &NORMAL).into_iter().filter(|name| !reached.contains(name)));
         reached.insert(name);
     }
-    const STRANGERS: [&str; 7] = [
+    const STRANGERS: [&str; 8] = [
         "scanhub-client",
         "scanhub-network",
+        "scanhub-perception",
         "scanhub-verbs",
         "scanhub-viewer",
         "scanhub-sim",
@@ -460,7 +477,7 @@ pub(crate) fn the_daemon_knows_neither_clients_nor_sim(tree: &Tree) -> Vec<Strin
 pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
     let ends: [&[&str]; 4] = [
         &["scanhub-daemon"],
-        &["scanhub-client", "scanhub-network", "scanhub-verbs", "scanhub-viewer"],
+        &["scanhub-client", "scanhub-network", "scanhub-perception", "scanhub-verbs", "scanhub-viewer"],
         &["scanhub-sim"],
         &["scanhub-tools"],
     ];

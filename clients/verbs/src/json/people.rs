@@ -7,7 +7,7 @@ use super::processed::millionths;
 use super::{Stamp, Words};
 
 /// Class `tracks`.
-pub(crate) fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl Serialize + 'a {
+pub fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
         #[serde(flatten)]
@@ -21,7 +21,7 @@ pub(crate) fn tracks<'a>(sensor: &'a str, header: &Header, tracks: &'a Tracks) -
 }
 
 /// Class `event`.
-pub(crate) fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Serialize + 'a {
+pub fn event<'a>(sensor: &'a str, header: &Header, event: &'a Event) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
         #[serde(flatten)]

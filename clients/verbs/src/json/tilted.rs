@@ -62,7 +62,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
 }
 
 /// Class `obstacles`.
-pub(crate) fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> impl Serialize + 'a {
+pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> impl Serialize + 'a {
     #[derive(Serialize)]
     struct Line<'a> {
         #[serde(flatten)]

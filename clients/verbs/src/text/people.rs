@@ -26,8 +26,12 @@ pub(crate) fn event(line: &mut Vec<u8>, header: &Header, event: &Event) -> io::R
     event_words(line, event)
 }
 
-/// What happened, as a sentence.
-pub(crate) fn event_words(line: &mut Vec<u8>, event: &Event) -> io::Result<()> {
+/// Writes an event as a sentence.
+///
+/// # Errors
+///
+/// Returns the error of the write.
+pub fn event_words(line: &mut Vec<u8>, event: &Event) -> io::Result<()> {
     let (id, room) = (event.id, event.room_name().unwrap_or("no room"));
     match (event.kind(), event.door()) {
         (_, Some((door, from, to))) => write!(line, "{id} went from {from} to {to} through {door}"),

@@ -29,7 +29,12 @@ pub(crate) fn cloud(line: &mut Vec<u8>, header: &Header, cloud: &Cloud) -> io::R
     sweep_words(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::DOUBTED))
 }
 
-pub(crate) fn obstacles(line: &mut Vec<u8>, header: &Header, found: &Obstacles) -> io::Result<()> {
+/// Writes number and stamp of a sweep, and its obstacles.
+///
+/// # Errors
+///
+/// Returns the error of the write.
+pub fn obstacles(line: &mut Vec<u8>, header: &Header, found: &Obstacles) -> io::Result<()> {
     numbers(line, header)?;
     let count = found.obstacles().len();
     write!(line, " sweep {} {count} {}", found.sweep, if count == 1 { "obstacle" } else { "obstacles" })?;

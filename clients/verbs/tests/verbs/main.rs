@@ -10,6 +10,5 @@ mod background;
 mod echo;
 mod latency;
 mod restart;
-mod track;
 mod verbs;
 mod zones;

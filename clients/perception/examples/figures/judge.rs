@@ -1,0 +1,190 @@
+//! How right the classes of points are, and where obstacles are found. Refuses to know how a hall is played.
+
+use scanhub_perception::tilt::{Obstacle, PointClass, Settings, Sweep};
+use scanhub_sim::room::BeamTarget;
+
+use super::hall::Hall;
+
+const SECOND: u64 = 1_000_000_000;
+
+/// Points of persons and of new things, and what they were taken for.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Score {
+    /// On persons; of these in the foreground.
+    pub(crate) persons: (usize, usize),
+    /// On what was put down and cannot be background yet; of these in the foreground.
+    pub(crate) things: (usize, usize),
+    /// In the foreground, though nothing is there that was not.
+    pub(crate) wrong: usize,
+}
+
+impl Score {
+    /// Adds the points of a sweep. What is put down counts as new until it was met in enough sweeps, and is not counted in
+    /// the two after that, nor is what stands beside it on the same beam.
+    pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
+        let new_ns = u64::from(settings.sweeps) * sweep_ns;
+        for point in sweep.points {
+            let is_found = point.class == PointClass::Foreground;
+            let count = |(all, found): &mut (usize, usize)| {
+                (*all, *found) = (*all + 1, *found + usize::from(is_found))
+            };
+            match hall.met(point) {
+                Some(BeamTarget::Person) => count(&mut self.persons),
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
+                    count(&mut self.things)
+                }
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 2 * sweep_ns => {}
+                Some(BeamTarget::Grazed | BeamTarget::Invalid) | None => {}
+                Some(_) => self.wrong += usize::from(is_found),
+            }
+        }
+    }
+
+    /// Share of the points on persons and new things that were found.
+    pub(crate) fn recall(&self) -> f64 {
+        share(self.persons.1 + self.things.1, self.persons.0 + self.things.0)
+    }
+
+    /// Share of the points that were found that are on persons and new things.
+    pub(crate) fn precision(&self) -> f64 {
+        let right = self.persons.1 + self.things.1;
+        share(right, right + self.wrong)
+    }
+}
+
+/// Objects that are new, and obstacles that were found.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Things {
+    /// Clusters of at least [`LEAST`] points on people and new things; of these found.
+    pub(crate) new: (usize, usize),
+    /// Obstacles on something new.
+    pub(crate) right: usize,
+    /// Obstacles where nothing is new.
+    pub(crate) wrong: usize,
+}
+
+/// An object with fewer points need not be found.
+const LEAST: usize = 15;
+/// Maximum distance between neighboring points of an object, in meters.
+const NEAR_M: f32 = 0.2;
+
+impl Things {
+    /// Adds the obstacles of a sweep. [`Score::add`] defines which points are new. It leaves out some
+    /// points; obstacles there do not count either.
+    pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
+        let new_ns = u64::from(settings.sweeps) * sweep_ns;
+        let (mut new, mut open) = (Vec::new(), Vec::new());
+        for point in sweep.points {
+            match hall.met(point) {
+                Some(BeamTarget::Person) => new.push(point.at),
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
+                    new.push(point.at)
+                }
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 3 * sweep_ns => {
+                    open.push(point.at);
+                }
+                _ => {}
+            }
+        }
+        let is_in = |one: &Obstacle, at: &[f32; 3]| {
+            (0..3).all(|i| (one.low[i] - 0.02..=one.high[i] + 0.02).contains(&at[i]))
+        };
+        for one in sweep.obstacles {
+            let on = |points: &[[f32; 3]]| points.iter().filter(|at| is_in(one, at)).count();
+            match (on(&new), on(&open)) {
+                (3.., _) => self.right += 1,
+                (_, 3..) => {}
+                _ => self.wrong += 1,
+            }
+        }
+        for cluster in clusters(&new).into_iter().filter(|cluster| cluster.len() >= LEAST) {
+            let in_some = cluster.iter().filter(|at| sweep.obstacles.iter().any(|one| is_in(one, at)));
+            self.new.0 += 1;
+            self.new.1 += usize::from(2 * in_some.count() >= cluster.len());
+        }
+    }
+
+    /// Returns the share of the new objects that were found.
+    pub(crate) fn recall(&self) -> f64 {
+        share(self.new.1, self.new.0)
+    }
+
+    /// Returns the share of the obstacles that are on something new.
+    pub(crate) fn precision(&self) -> f64 {
+        share(self.right, self.right + self.wrong)
+    }
+}
+
+/// Points that are near each other, directly or over others.
+fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
+    let mut open = points.to_vec();
+    let mut clusters = Vec::new();
+    while let Some(first) = open.pop() {
+        let mut cluster = vec![first];
+        let mut next = 0;
+        while let Some(at) = cluster.get(next).copied() {
+            next += 1;
+            let is_near = |other: &mut [f32; 3]| {
+                (0..3).map(|i| (at[i] - other[i]).powi(2)).sum::<f32>() < NEAR_M * NEAR_M
+            };
+            cluster.extend(open.extract_if(.., is_near));
+        }
+        clusters.push(cluster);
+    }
+    clusters
+}
+
+/// A share of a count that may be 0.
+pub(crate) fn share(part: usize, all: usize) -> f64 {
+    part as f64 / all as f64
+}
+
+/// When the pole and the box of world `tilt` were among the obstacles: beginning of the sweep, and whether.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Seen {
+    pole: Vec<(u64, bool)>,
+    boxed: Vec<(u64, bool)>,
+}
+
+impl Seen {
+    /// Adds the obstacles of a sweep.
+    pub(crate) fn add(&mut self, sweep: &Sweep<'_>) {
+        let found = |at: [f32; 2], wide: f32| sweep.obstacles.iter().any(|one| stands_at(one, at, wide));
+        // In the world x is to the right and y ahead.
+        self.pole.push((sweep.from_ns, found([2.0, -0.3], 0.6)));
+        self.boxed.push((sweep.from_ns, found([2.6, 0.9], 0.8)));
+    }
+
+    /// Whether the pole was found in the first whole sweep in which it stood.
+    pub(crate) fn is_pole_found_at_once(&self) -> bool {
+        self.pole.iter().find(|(from_ns, _)| *from_ns >= seconds(POLE_S)).is_some_and(|(_, found)| *found)
+    }
+
+    /// In how many sweeps the pole was found, until it was background.
+    pub(crate) fn sweeps_of_pole(&self) -> usize {
+        self.pole.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(POLE_S - 2)).count()
+    }
+
+    /// The same of the box.
+    pub(crate) fn sweeps_of_box(&self) -> usize {
+        self.boxed.iter().filter(|(from_ns, found)| *found && *from_ns > seconds(BOX_S - 2)).count()
+    }
+}
+
+/// Whether `obstacle` is what stands at `x` and `y` and is so wide at most.
+fn stands_at(obstacle: &Obstacle, [x, y]: [f32; 2], wide: f32) -> bool {
+    (obstacle.middle[0] - x).hypot(obstacle.middle[1] - y) < wide / 2.0
+        && obstacle.high[0] - obstacle.low[0] < wide
+        && obstacle.high[1] - obstacle.low[1] < wide
+}
+
+/// When world `tilt` puts up its pole and puts down its box.
+const POLE_S: u64 = 30;
+const BOX_S: u64 = 36;
+/// Its mount swings by 50 degrees at 30 degrees a second.
+pub(crate) const SWEEP_NS: u64 = 1_666_666_667;
+
+/// Seconds in ns.
+pub(crate) const fn seconds(s: u64) -> u64 {
+    s * SECOND
+}

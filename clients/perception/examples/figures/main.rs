@@ -1,0 +1,211 @@
+//! What three dimensions are worth: recall, precision and points of world `tilt` over seeds, and what faulty angles do.
+//!
+//! ```sh
+//! cargo run --release -p scanhub-perception --example figures
+//! ```
+
+mod hall;
+mod halls;
+mod judge;
+
+use std::ops::Range;
+
+use hall::Hall;
+use judge::{Score, Seen, Things, seconds, share};
+use scanhub_perception::tilt::{Settings, Withheld};
+use scanhub_sim::mount::{Fault, FaultKind};
+use scanhub_sim::world::World;
+
+/// So many halls.
+const SEEDS: u64 = 10;
+
+fn main() -> Result<(), scanhub_schema::Failure> {
+    let world: World = "tilt".parse()?;
+    let part = std::env::args().nth(1);
+    // The caller can choose halls that the library was not tuned on.
+    let number = |nth: usize| std::env::args().nth(nth).and_then(|text| text.parse().ok());
+    let halls = |count: u64| {
+        let from = number(2).unwrap_or(0);
+        from..number(3).unwrap_or(from + count)
+    };
+    let is_wanted = |name: &str| part.as_deref().is_none_or(|part| part == name);
+    if is_wanted("unchanging") {
+        unchanging(halls(4));
+    }
+    if is_wanted("changing") {
+        changing(halls(SEEDS));
+    }
+    if is_wanted("stamps") {
+        late_stamps();
+    }
+    if is_wanted("cost") {
+        let cost = |seed| Hall::new(&halls::changing(seed), seed).cost(Settings::default(), 80);
+        println!("time of the library for a scan of 361 beams, in three halls: {:?}", [0, 1, 2].map(cost));
+    }
+    if is_wanted("people") {
+        people(&world);
+    }
+    if is_wanted("faults") {
+        println!(
+            "fault from 20 to 24 s: beams withheld (silent, jumped, inconsistent, standing), sweeps doubted of all"
+        );
+        println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
+        for (name, kind) in FAULTS {
+            fault(&world, name, kind);
+        }
+    }
+    Ok(())
+}
+
+const FAULTS: [(&str, FaultKind); 8] = [
+    ("halts", FaultKind::Halts),
+    ("silent", FaultKind::Silent),
+    ("stuck", FaultKind::Stuck),
+    ("jumps by 8 degrees", FaultKind::Jumps(8.0)),
+    ("jumps by -3 degrees", FaultKind::Jumps(-3.0)),
+    ("lies by 4 degrees", FaultKind::Lies(4.0)),
+    ("late by 0.2 s", FaultKind::Late(0.2)),
+    ("late by 1 s", FaultKind::Late(1.0)),
+];
+
+/// Halls in which nothing changes, for 200 sweeps: obstacles that are invented once the background is known.
+fn unchanging(halls: Range<u64>) {
+    let (mut sweeps, mut with, mut obstacles, mut late) = (0, 0, 0, 0);
+    for seed in halls.clone() {
+        let mut hall = Hall::new(&halls::unchanging(seed), seed);
+        let until_s = 200 * hall.sweep_ns() / seconds(1);
+        hall.play(Settings::default(), until_s, |_, sweep| {
+            let is_known = sweep.number > 6;
+            sweeps += u32::from(is_known);
+            with += u32::from(is_known && !sweep.obstacles.is_empty());
+            obstacles += if is_known { sweep.obstacles.len() } else { 0 };
+            late += if sweep.number >= 100 { sweep.obstacles.len() } else { 0 };
+        });
+    }
+    println!(
+        "halls {halls:?} without changes, 200 sweeps each: {obstacles} obstacles in {with} of {sweeps} sweeps"
+    );
+    println!("  {late} of these in the second hundred");
+}
+
+/// Furnished halls with new things and a person: obstacles.
+fn changing(halls: Range<u64>) {
+    let settings = Settings::default();
+    let mut all = Things::default();
+    for seed in halls.clone() {
+        let mut things = Things::default();
+        let mut hall = Hall::new(&halls::changing(seed), seed);
+        hall.play(settings, 80, |hall, sweep| {
+            if sweep.from_ns > seconds(20) {
+                things.add(hall, sweep, &settings, hall.sweep_ns());
+            }
+        });
+        all.new = (all.new.0 + things.new.0, all.new.1 + things.new.1);
+        (all.right, all.wrong) = (all.right + things.right, all.wrong + things.wrong);
+    }
+    println!(
+        "furnished halls {halls:?}, 80 s each: obstacles recall {:.3} of {}, precision {:.3} of {}",
+        all.recall(),
+        all.new.0,
+        all.precision(),
+        all.right + all.wrong
+    );
+}
+
+/// Stamps of angles that are wrong from the start, in halls in which nothing changes.
+fn late_stamps() {
+    println!(
+        "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; doubted sweeps"
+    );
+    for by_s in [0.0, 0.005, 0.01, 0.03, 0.1, -0.03] {
+        let (mut errors, mut obstacles, mut doubted, mut sweeps) = (Vec::new(), 0, 0, 0);
+        let mut found = Vec::new();
+        for seed in 0..4 {
+            let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
+            let world = halls::unchanging(seed).with_mount_faults(&[fault]);
+            let mut hall = Hall::new(&world, seed);
+            let counts = hall.play(Settings::default(), 40, |hall, sweep| {
+                if sweep.from_ns > seconds(20) {
+                    errors.extend(sweep.points.iter().map(|point| hall.error_m(point)));
+                    obstacles += sweep.obstacles.len();
+                }
+            });
+            found.push(hall.late_ns as f64 / 1e6);
+            (doubted, sweeps) = (doubted + counts.doubted, sweeps + counts.sweeps);
+        }
+        errors.sort_by(f64::total_cmp);
+        let at = |share: f64| 1000.0 * errors[((errors.len() - 1) as f64 * share) as usize];
+        println!(
+            "  {:4.0} ms: {found:.1?} ms; {:.1} mm, {:.1} mm; {obstacles}; {doubted} of {sweeps}",
+            1000.0 * by_s,
+            at(0.5),
+            at(0.99)
+        );
+    }
+}
+
+fn people(world: &World) {
+    let settings = Settings::default();
+    let mut all = Score::default();
+    let (mut at_once, mut errors) = (0, Vec::new());
+    let (mut poles, mut boxes) = (Vec::new(), Vec::new());
+    let (mut recalls, mut precisions) = (Vec::new(), Vec::new());
+    for seed in 0..SEEDS {
+        let (mut score, mut seen) = (Score::default(), Seen::default());
+        Hall::new(world, seed).play(settings, 60, |hall, sweep| {
+            seen.add(sweep);
+            if sweep.until_ns > seconds(20) {
+                score.add(hall, sweep, &settings, judge::SWEEP_NS);
+            }
+            let far = sweep.points.iter().filter(|point| (4.8..5.2).contains(&hall.range_m(point)));
+            errors.extend(far.map(|point| hall.error_m(point)));
+        });
+        at_once += u32::from(seen.is_pole_found_at_once());
+        poles.push(seen.sweeps_of_pole());
+        boxes.push(seen.sweeps_of_box());
+        recalls.push(score.recall());
+        precisions.push(score.precision());
+        all.persons = (all.persons.0 + score.persons.0, all.persons.1 + score.persons.1);
+        all.things = (all.things.0 + score.things.0, all.things.1 + score.things.1);
+        all.wrong += score.wrong;
+    }
+    let least = |values: &[f64]| values.iter().copied().fold(1.0, f64::min);
+    println!("{SEEDS} halls of 60 s, sweeps of 50 degrees at 30 degrees a second, background after 5 sweeps");
+    println!("pole at 2 m found in the first whole sweep: {at_once} of {SEEDS}");
+    println!("sweeps until it is background: {poles:?}; the box: {boxes:?}");
+    let [persons, things] = [all.persons, all.things].map(|(points, found)| share(found, points));
+    println!(
+        "recall {:.3} [least {:.3}]: persons {persons:.3}, pole and box {things:.3}",
+        all.recall(),
+        least(&recalls)
+    );
+    println!("precision {:.3} [least {:.3}]", all.precision(), least(&precisions));
+    errors.sort_by(f64::total_cmp);
+    let at = |share: f64| 1000.0 * errors[((errors.len() - 1) as f64 * share) as usize];
+    println!(
+        "error of points 5 m away beside the noise of the ranges: p50 {:.2} mm, p99 {:.2} mm, most {:.2} mm",
+        at(0.5),
+        at(0.99),
+        at(1.0)
+    );
+}
+
+fn fault(world: &World, name: &str, kind: FaultKind) {
+    let fault = Fault { kind, from_s: 20.0, until_s: 24.0 };
+    let (mut most, mut invented) = (0.0_f64, 0);
+    // Nobody has come yet.
+    let world = world.clone().with_mount_faults(&[fault]);
+    let counts = Hall::new(&world, 1).play(Settings::default(), 29, |hall, sweep| {
+        if !sweep.is_doubted {
+            most = sweep.points.iter().map(|point| hall.error_m(point)).fold(most, f64::max);
+            invented += if sweep.until_ns < seconds(24) { sweep.obstacles.len() } else { 0 };
+        }
+    });
+    let [silent, jumped, inconsistent, standing]: [u64; Withheld::COUNT] = counts.withheld;
+    println!(
+        "{name:20} {silent:6} {jumped:6} {inconsistent:6} {standing:6}  {} of {}  {:.1} mm  {invented}",
+        counts.doubted,
+        counts.sweeps,
+        1000.0 * most
+    );
+}

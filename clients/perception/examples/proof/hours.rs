@@ -1,0 +1,109 @@
+//! A long time: other people come every ten minutes, one scan a minute comes late, and the tracker neither grows nor gives an
+//! identity twice.
+
+use std::time::Instant;
+
+use scanhub_perception::track::{People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Pose, Scan};
+
+use crate::house::{BEAMS, Eye, House};
+use crate::walkers::Crowd;
+
+const HOUR_S: u64 = 3600;
+/// Shares of changes of the room, and of rests on a chair.
+const PLANS: (f64, f64) = (0.25, 0.25);
+/// Scans a second, one sensor after the other.
+const SCANS_HZ: u64 = 100;
+const DELAY_NS: u64 = 80_000_000;
+/// So long the same people are there, and then others.
+const VISIT_S: u64 = 600;
+/// So much later than the others a late scan comes.
+const LATE_NS: u64 = 300_000_000;
+const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
+
+/// Follows `people` at a time for so many virtual hours and says each hour what there is.
+pub(crate) fn run(hours: u64, people: usize) {
+    let house = House { is_ideal: false };
+    let site = Site::parse("house.toml", &house.site()).expect("the house is right");
+    let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..site.sensors.len())
+        .map(|sensor| {
+            let segmenter = Segmenter::new(Pose::default(), BEAMS);
+            (Eye::new(house, sensor, hours), Model::new(Settings::default(), BEAMS), segmenter)
+        })
+        .collect();
+    let sensors = eyes.len() as u64;
+    let mut tracker = People::new(site, DELAY_NS);
+    let mut ids = Identities::default();
+    let mut held: Option<(usize, u64, Box<Scan>, Box<Foreground>)> = None;
+    let (mut sent_late, mut tracker_s) = (0, 0.0);
+    let mut crowd = Crowd::new(house, 0, 0.0, PLANS, 0);
+    for step in 0..hours * HOUR_S * SCANS_HZ {
+        if step % (VISIT_S * SCANS_HZ) == 0 {
+            crowd = Crowd::new(house, people, 12.0, PLANS, step);
+        }
+        let visit_s = (step % (VISIT_S * SCANS_HZ)) as f64 / SCANS_HZ as f64;
+        crowd.step(visit_s, 1.0 / SCANS_HZ as f64);
+        let sensor = (step % sensors) as usize;
+        let (eye, model, segmenter) = &mut eyes[sensor];
+        let scan = eye.scan(&|_| crowd.shapes(), step * 1_000_000_000 / SCANS_HZ);
+        let mut foreground = Foreground::of(BEAMS);
+        model.update(&scan, &mut foreground);
+        segmenter.update(&scan, &mut foreground);
+        let now_ns = BEGIN_NS + step * 1_000_000_000 / SCANS_HZ;
+        if step % (60 * SCANS_HZ) == 30 * SCANS_HZ {
+            held = Some((sensor, now_ns, scan, foreground));
+            continue;
+        }
+        let begin = Instant::now();
+        tracker.take(sensor, now_ns, &scan, &foreground, |picture| ids.take(picture));
+        if let Some((sensor, at_ns, scan, foreground)) = held.take_if(|held| held.1 + LATE_NS < now_ns) {
+            sent_late += 1;
+            tracker.take(sensor, at_ns, &scan, &foreground, |picture| ids.take(picture));
+        }
+        tracker_s += begin.elapsed().as_secs_f64();
+        if (step + 1) % (HOUR_S * SCANS_HZ) == 0 {
+            let hour = (step + 1) / (HOUR_S * SCANS_HZ);
+            println!(
+                "{hour} h: {} kB at most, {} identities shown, {} used again, {} of {sent_late} scans late, {:.0} times the clock",
+                peak_kb(),
+                ids.shown,
+                ids.again,
+                tracker.counts().late,
+                (hour * HOUR_S) as f64 / tracker_s
+            );
+        }
+    }
+}
+
+/// Identities rise: one that was not in the last picture and is not above all before was used again.
+#[derive(Default)]
+struct Identities {
+    highest: u64,
+    last: Vec<u64>,
+    shown: u64,
+    again: u64,
+}
+
+impl Identities {
+    fn take(&mut self, picture: &Picture) {
+        let highest = self.highest;
+        for track in &picture.tracks {
+            if !self.last.contains(&track.id) {
+                self.shown += 1;
+                self.again += u64::from(track.id <= highest);
+            }
+            self.highest = self.highest.max(track.id);
+        }
+        self.last.clear();
+        self.last.extend(picture.tracks.iter().map(|track| track.id));
+    }
+}
+
+/// The most memory that the program has had, simulation and all.
+fn peak_kb() -> String {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    line.and_then(|line| line.split_whitespace().next()).unwrap_or("?").to_owned()
+}

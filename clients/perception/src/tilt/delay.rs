@@ -1,0 +1,207 @@
+//! Estimates how much later than its angles the stamps of a mount are. With late stamps, a surface is too low in sweeps one
+//! way and too high in sweeps the other way. A play of the gears looks the same.
+
+use crate::tilt::scenery::Ray;
+
+/// Number of directions of the scanner that are compared.
+const COLUMNS: usize = 24;
+/// Fewer points on slopes do not show a delay.
+const ENOUGH: usize = 60;
+/// Two sweeps that are farther apart than this show a delay, in radians: 0.1 degrees.
+const LEAST_RAD: f64 = 0.0017;
+/// Maximum delay that is corrected, in seconds.
+pub(crate) const MOST_S: f64 = 0.15;
+/// Meters that the end of a beam moves by per radian of the mount's angle. On flatter slopes, noise hides the delay.
+const LEAST_SLOPE_M: f64 = 3.0;
+/// Two neighboring slopes on one surface differ by at most this share.
+const BEND: f64 = 0.3;
+/// Points farther apart than this, in radians, are not joined.
+const GAP_RAD: f64 = 0.06;
+
+/// A beam of a sweep.
+#[derive(Clone, Copy)]
+struct Sample {
+    time_s: f64,
+    angle_rad: f64,
+    /// One divided by the range in meters. On a plane, it grows evenly with the angle.
+    inverse: f64,
+}
+
+/// The sampled beams of a sweep, by direction.
+#[derive(Default)]
+struct Profile {
+    columns: Vec<Vec<Sample>>,
+    until_ns: u64,
+}
+
+/// Compares each complete sweep with the one before it.
+#[derive(Default)]
+pub(crate) struct Delay {
+    before: Profile,
+    now: Profile,
+    /// The delay that each point shows, in seconds.
+    votes: Vec<f64>,
+    /// The delay that the last pair of sweeps showed, in seconds.
+    last: Option<f64>,
+}
+
+impl Delay {
+    /// Forgets all sweeps.
+    pub(crate) fn forget(&mut self) {
+        (self.before.until_ns, self.now.until_ns, self.last) = (0, 0, None);
+    }
+
+    /// Takes a sweep of scans that have `beams` beams. Returns the delay in seconds that remains after earlier corrections, once
+    /// two pairs of sweeps in a row show the same one.
+    pub(crate) fn take(
+        &mut self,
+        rays: &[Ray],
+        beams: usize,
+        (from_ns, until_ns): (u64, u64),
+        is_complete: bool,
+    ) -> Option<f64> {
+        std::mem::swap(&mut self.before, &mut self.now);
+        self.now.fill(rays, beams, from_ns);
+        self.now.until_ns = if is_complete { until_ns } else { 0 };
+        let is_pair = is_complete && self.before.until_ns == from_ns;
+        let measured = if is_pair { self.measure() } else { None };
+        let before = std::mem::replace(&mut self.last, measured.map(|(late_s, _)| late_s));
+        let ((late_s, rate), before_s) = (measured?, before?);
+        let agrees = (late_s - before_s).abs() * rate < LEAST_RAD.max(0.2 * late_s.abs() * rate);
+        let is_worth_it = late_s.abs().min(before_s.abs()) * rate > LEAST_RAD && late_s.abs() < MOST_S;
+        (agrees && is_worth_it).then_some(late_s)
+    }
+
+    /// Returns the delay in seconds, and the rate at which the two sweeps move apart by it, in radians a second.
+    fn measure(&mut self) -> Option<(f64, f64)> {
+        let mut late_s = 0.0;
+        for _ in 0..4 {
+            let mut rate = 0.0;
+            self.votes.clear();
+            for (now, before) in self.now.columns.iter().zip(&self.before.columns) {
+                for around in now.windows(3) {
+                    if let Some((vote, apart)) = vote(around, before, late_s) {
+                        self.votes.push(vote);
+                        rate += apart;
+                    }
+                }
+            }
+            if self.votes.len() < ENOUGH {
+                return None;
+            }
+            rate /= self.votes.len() as f64;
+            let middle = self.votes.len() / 2;
+            let more_s = *self.votes.select_nth_unstable_by(middle, f64::total_cmp).1;
+            late_s += more_s;
+            if more_s.abs() * rate < LEAST_RAD {
+                return Some((late_s, rate));
+            }
+        }
+        None
+    }
+}
+
+/// Returns the delay that the middle one of three samples shows in addition to `late_s`, and the rate at which the sweeps move
+/// apart with it.
+fn vote(around: &[Sample], before: &[Sample], late_s: f64) -> Option<(f64, f64)> {
+    let [first, here, last] = around else { return None };
+    let rate = (last.angle_rad - first.angle_rad) / (last.time_s - first.time_s);
+    let apart = rate - slopes(before, here.angle_rad)?.rate;
+    let angle_rad = here.angle_rad + apart * late_s;
+    let there = slopes(before, angle_rad)?;
+    let expected = there.at.inverse + there.slope * (angle_rad - there.at.angle_rad);
+    let is_steep = there.slope.abs() > LEAST_SLOPE_M * here.inverse * here.inverse;
+    // Where the mount turns back, the sweeps are hardly apart.
+    let goes_back = rate * there.rate < 0.0 && apart.abs() > rate.abs();
+    (is_steep && goes_back).then(|| ((here.inverse - expected) / (there.slope * apart), apart.abs()))
+}
+
+/// A sample, and how what is around it changes with the angle.
+struct Slopes {
+    at: Sample,
+    slope: f64,
+    rate: f64,
+}
+
+/// Returns the slope at an angle, if the two samples on each side are on one plane.
+fn slopes(column: &[Sample], angle_rad: f64) -> Option<Slopes> {
+    let after = column.partition_point(|sample| sample.angle_rad < angle_rad);
+    let [a, b, c, d] = column.get(after.checked_sub(2)?..after + 2)? else { return None };
+    let slope = |a: &Sample, b: &Sample| (b.inverse - a.inverse) / (b.angle_rad - a.angle_rad);
+    let [left, middle, right] = [slope(a, b), slope(b, c), slope(c, d)];
+    let is_plane = (left - middle).abs().max((right - middle).abs()) < BEND * middle.abs();
+    let is_near = d.angle_rad - a.angle_rad < 3.0 * GAP_RAD;
+    let rate = (d.angle_rad - a.angle_rad) / (d.time_s - a.time_s);
+    (is_plane && is_near).then_some(Slopes { at: *b, slope: middle, rate })
+}
+
+impl Profile {
+    /// Takes the beams that are compared, by growing angles.
+    fn fill(&mut self, rays: &[Ray], beams: usize, from_ns: u64) {
+        let every = (beams / COLUMNS).max(1);
+        self.columns.resize_with(beams.div_ceil(every), Vec::new);
+        self.columns.iter_mut().for_each(Vec::clear);
+        for ray in rays {
+            let beam = usize::from(ray.beam);
+            if beam.is_multiple_of(every)
+                && ray.range_m.is_finite()
+                && ray.range_m > 0.0
+                && let Some(column) = self.columns.get_mut(beam / every)
+            {
+                column.push(Sample {
+                    time_s: (ray.time_ns as f64 - from_ns as f64) * 1e-9,
+                    angle_rad: ray.angle_rad,
+                    inverse: 1.0 / f64::from(ray.range_m),
+                });
+            }
+        }
+        let falls = |column: &Vec<Sample>| match (column.first(), column.last()) {
+            (Some(first), Some(last)) => last.angle_rad < first.angle_rad,
+            _ => false,
+        };
+        self.columns.iter_mut().filter(|column| falls(column)).for_each(|column| column.reverse());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Sweeps of a mount 0.9 m above the floor that swings like a pendulum from 5 to 45 degrees in 2 s; its encoder has
+    /// a standard deviation of about 0.05 degrees, and its stamps are `late_s` late.
+    fn delays(late_s: f64, seed: u64) -> Vec<Option<f64>> {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let mut noise = |sigma: f64| (0..12).map(|_| random.f64()).sum::<f64>() * sigma - 6.0 * sigma;
+        let swing = |s: f64| (25.0 - 20.0 * (std::f64::consts::PI * s / 2.0).cos()).to_radians();
+        let mut delay = Delay::default();
+        let mut sweep = |number: u64| {
+            let mut rays = Vec::new();
+            for scan in 0..75 {
+                let time_ns = number * 2_000_000_000 + scan * 26_640_000;
+                let down = swing(time_ns as f64 * 1e-9);
+                let angle_rad = swing(time_ns as f64 * 1e-9 - late_s) + noise(0.001);
+                for beam in 0..181 {
+                    let beam_rad = f64::from(beam - 90).to_radians();
+                    let range_m =
+                        (0.9 / (down.sin() * beam_rad.cos())).min(4.0 / beam_rad.cos()) + noise(0.01);
+                    let (beam, range_m) = (beam as u16, range_m as f32);
+                    rays.push(Ray { time_ns, angle_rad, beam_rad, range_m, beam });
+                }
+            }
+            delay.take(&rays, 181, (number * 2_000_000_000, (number + 1) * 2_000_000_000), true)
+        };
+        (0..4).map(&mut sweep).collect()
+    }
+
+    #[test]
+    fn two_pairs_of_sweeps_show_the_delay_of_a_pendulum() {
+        for (seed, late_s) in [0.02, -0.02, 0.06, 0.12].into_iter().enumerate() {
+            let found = delays(late_s, seed as u64);
+            assert_eq!(found[..2], [None; 2], "{late_s}");
+            let found = found[2].unwrap_or_else(|| panic!("{late_s}: {found:?}"));
+            assert!((found - late_s).abs() < 0.002, "{late_s}: {found}");
+        }
+        assert_eq!(delays(0.0, 9), [None; 4]);
+        assert_eq!(delays(0.0005, 9), [None; 4], "not worth it");
+    }
+}

@@ -1,0 +1,210 @@
+//! Doors, and who comes out of an unseen way: which door leads from room to room, and how likely it is that somebody who
+//! went in then is the one who is seen now. Refuses to know sensors.
+
+use crate::track::geometry::{Point, distance_to_segment, length2, middle, minus};
+use crate::track::site::Site;
+
+/// Longest time of a way of which no gap tells.
+pub(crate) const LONGEST_S: f64 = 60.0;
+/// Spread of the logarithm of how fast somebody walks, around his own pace.
+const SPREAD: f64 = 0.2;
+/// Share of those who walk on without a stop, if they walked when they were seen last, and if they stood.
+const WALKS: f64 = 0.6;
+const WALKS_ON: f64 = 0.3;
+/// Share of those who stay where they are, and for how many seconds they do.
+const STAYS: f64 = 0.4;
+const STAYS_S: f64 = 4.0;
+/// Share of those who turn round.
+const TURNS: f64 = 0.04;
+/// Who is faster than this walks.
+const WALKING_M_S: f64 = 0.5;
+/// Who goes back is at least so fast.
+const BACK_M_S: f64 = 0.35;
+/// How well places are known, along the way and beside it; beside it they spread by so much a second, to the width of a way.
+const ALONG_M: f64 = 0.25;
+const BESIDE_M: f64 = 0.25;
+const BESIDE_M_S: f64 = 0.3;
+const WIDTH_M: f64 = 0.7;
+/// Who would be sooner or much later than the gap says.
+const HARDLY: f64 = 1e-6;
+/// Length of a way whose end is not known.
+const REST_M: f64 = 5.0;
+
+/// Somebody who is out of sight.
+pub(crate) struct Gone {
+    /// The door that he came by.
+    pub(crate) entry: Option<usize>,
+    /// Where he was last, and how fast.
+    pub(crate) at: Point,
+    pub(crate) speed: f64,
+    /// How fast he walks when he does.
+    pub(crate) pace: f64,
+}
+
+/// Somebody who is new.
+pub(crate) struct New {
+    /// The door that he is the nearest to.
+    pub(crate) exit: usize,
+    /// Where he was seen first.
+    pub(crate) at: Point,
+    pub(crate) velocity: Point,
+    /// He is behind that door, in a room with sensors.
+    pub(crate) is_out: bool,
+}
+
+impl Site {
+    /// Returns the door from `from` to `to` that is nearest to `place`.
+    pub(crate) fn door_between(&self, from: Option<usize>, to: Option<usize>, place: Point) -> Option<usize> {
+        let between = |door: usize| {
+            let ends = (self.doors[door].from, self.doors[door].to);
+            ends == (from, to) || ends == (to, from)
+        };
+        let off = |&door: &usize| distance_to_segment(place, self.doors[door].between);
+        (0..self.doors.len()).filter(|&door| between(door)).min_by(|a, b| off(a).total_cmp(&off(b)))
+    }
+
+    /// Returns the seconds of the gap between two doors, shortest and longest.
+    fn gap(&self, [a, b]: [usize; 2]) -> [f64; 2] {
+        let found = self.gaps.iter().find(|gap| gap.doors == [a, b] || gap.doors == [b, a]);
+        found.map_or([0.0, LONGEST_S], |gap| gap.seconds)
+    }
+
+    /// Returns how likely it is, per square metre, that `gone`, who went out of sight `after_s` seconds ago, is where `new` is
+    /// seen, given that he is still on his way: he walks on at his pace, walks on after a stop, stays, or turns round.
+    pub(crate) fn likelihood(&self, gone: &Gone, new: &New, after_s: f64) -> f64 {
+        let t = after_s.max(0.0);
+        let off = minus(new.at, gone.at);
+        let far_m = length2(off).sqrt();
+        // How far ahead he would be, how long the rest of the way was, and how fast he goes ahead.
+        let (ahead_m, rest_m, speed) = match gone.entry {
+            Some(entry) => {
+                let door = self.doors[entry].between;
+                let returns = new.is_out && new.exit == entry;
+                let from_door = distance_to_segment(new.at, door);
+                let now_m = if returns { -from_door } else { from_door };
+                let end = if new.exit == entry { new.at } else { middle(self.doors[new.exit].between) };
+                let way = minus(end, middle(door));
+                let along =
+                    (way[0] * new.velocity[0] + way[1] * new.velocity[1]) / length2(way).sqrt().max(0.1);
+                let rest_m = if new.exit == entry {
+                    REST_M
+                } else {
+                    distance_to_segment(gone.at, self.doors[new.exit].between)
+                };
+                let ahead_m = now_m - distance_to_segment(gone.at, door);
+                let [shortest_s, longest_s] = self.gap([entry, new.exit]);
+                let is_too_soon = ahead_m * shortest_s > (t + 0.5) * length2(way).sqrt();
+                if is_too_soon || t > 2.0 * longest_s {
+                    return HARDLY;
+                }
+                (ahead_m, rest_m, if returns { -along } else { along })
+            }
+            None => (far_m, REST_M, 0.0),
+        };
+        let beside_m = (far_m * far_m - ahead_m * ahead_m).max(0.0).sqrt();
+        let walked_m = gone.pace.max(0.3) * t;
+        let (range_m, sigma_m) = (walked_m.max(0.3), ALONG_M + SPREAD * walked_m);
+        let walks = if gone.speed > WALKING_M_S { WALKS } else { WALKS_ON };
+        let stays = STAYS * (-t / STAYS_S).exp();
+        let stops = 1.0 - walks - stays;
+        let within =
+            |least: f64, most: f64| if (least..=most).contains(&ahead_m) { 1.0 / range_m } else { 0.0 };
+        let density = walks * normal(ahead_m - walked_m, sigma_m)
+            + stops * within(-0.1, range_m)
+            + stays * normal(ahead_m, ALONG_M)
+            + TURNS * within(-range_m, 0.0).max(0.01);
+        let remains = walks * normal_below((rest_m - walked_m) / sigma_m)
+            + stops * (rest_m / range_m).min(1.0)
+            + stays
+            + TURNS;
+        let beside = normal(beside_m, (BESIDE_M + BESIDE_M_S * t).min(WIDTH_M));
+        let turns = if speed < -BACK_M_S { TURNS } else { 1.0 };
+        turns * beside * density / remains
+    }
+}
+
+/// Density of a normal distribution at `x`.
+fn normal(x: f64, sigma: f64) -> f64 {
+    (-x * x / (2.0 * sigma * sigma)).exp() / (sigma * (2.0 * std::f64::consts::PI).sqrt())
+}
+
+/// Probability that a standard normal number is less than `z`: the error function by Abramowitz and Stegun 7.1.26,
+/// within 2e-7.
+fn normal_below(z: f64) -> f64 {
+    let x = z.abs() / std::f64::consts::SQRT_2;
+    let t = 1.0 / (1.0 + 0.327_591_1 * x);
+    let series = [1.061_405_429, -1.453_152_027, 1.421_413_741, -0.284_496_736, 0.254_829_592];
+    let poly = series.iter().fold(0.0, |sum, c| (sum + c) * t);
+    let erf = 1.0 - poly * (-x * x).exp();
+    if z < 0.0 { (1.0 - erf) / 2.0 } else { (1.0 + erf) / 2.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Gone, New, normal_below};
+    use crate::track::Site;
+
+    const HOUSE: &str = r#"
+[[sensor]]
+name = "front"
+pose = { x = 0.1, y = 2.5, yaw = 0.0 }
+[[sensor]]
+name = "rear"
+pose = { x = 16.9, y = 2.5, yaw = 3.1416 }
+[[room]]
+name = "hall"
+polygon = [[0, 0], [6, 0], [6, 5], [0, 5]]
+[[room]]
+name = "corridor"
+polygon = [[6, 1.5], [11, 1.5], [11, 3.5], [6, 3.5]]
+[[room]]
+name = "kitchen"
+polygon = [[11, 0], [17, 0], [17, 5], [11, 5]]
+[[door]]
+name = "left"
+from = "hall"
+to = "corridor"
+between = [[6, 2], [6, 3]]
+[[door]]
+name = "right"
+from = "corridor"
+to = "kitchen"
+between = [[11, 2], [11, 3]]
+[[gap]]
+between = ["left", "right"]
+seconds = [2, 15]
+"#;
+
+    #[test]
+    fn who_comes_from_the_other_side_comes_out_and_who_stood_there_still_does() {
+        let site = Site::parse("house.toml", HOUSE).expect("a house");
+        let gone = |entry: usize, x: f64| Gone { entry: Some(entry), at: [x, 2.5], speed: 1.0, pace: 1.1 };
+        let (from_left, from_right) = (gone(0, 6.5), gone(1, 10.5));
+        let new = |x: f64, vx: f64| New { exit: 0, at: [x, 2.5], velocity: [vx, 0.0], is_out: x < 6.0 };
+        for comes in [new(6.7, -1.0), new(5.7, -1.0)] {
+            let (turns, walks) =
+                (site.likelihood(&from_left, &comes, 4.0), site.likelihood(&from_right, &comes, 4.0));
+            assert!(walks > 10.0 * turns, "{walks} and {turns}");
+        }
+        let stands = new(6.6, 0.0);
+        let (stays, flies) =
+            (site.likelihood(&from_left, &stands, 0.4), site.likelihood(&from_right, &stands, 0.4));
+        assert!(stays > 10.0 * flies, "{stays} and {flies}");
+        // The gap says at least 2 s, and at most 15.
+        assert!(site.likelihood(&from_right, &new(6.0, -1.0), 1.0) < 1e-4);
+        assert!(site.likelihood(&from_right, &new(6.0, -1.0), 31.0) < 1e-4);
+    }
+
+    #[test]
+    fn the_normal_distribution_agrees_with_its_integral() {
+        let mut sum = 0.0;
+        for i in 0..80_000 {
+            let z = -4.0 + 1e-4 * f64::from(i);
+            if i % 5_000 == 0 {
+                assert!((normal_below(z) - sum - 3.17e-5).abs() < 1e-5, "{z}: {} {sum}", normal_below(z));
+            }
+            let mid = z + 0.5e-4;
+            sum += 1e-4 * (-mid * mid / 2.0).exp() / (2.0 * std::f64::consts::PI).sqrt();
+        }
+    }
+}

@@ -1,0 +1,388 @@
+//! One scan as a sensor of the site sees it: how far it looks in each direction, the legs in it, and whether a place is seen,
+//! hidden or seen through. Refuses to know whose legs they are.
+
+use std::f64::consts::{FRAC_PI_4, TAU};
+
+use scanhub_schema::{Foreground, Scan};
+
+use crate::track::geometry::{Point, distance, minus};
+use crate::track::site::{Sensor, Site};
+
+/// The most legs of a scan.
+pub const LEGS: usize = 64;
+/// Radius of a leg with its trousers, in metres.
+pub(crate) const LEG_M: f64 = 0.06;
+/// What is wider is two legs beside each other.
+const WIDEST_LEG_M: f64 = 0.26;
+/// Minimum width of a leg with its trousers. The legs of chairs and tables are thinner.
+const THINNEST_LEG_M: f64 = 0.09;
+/// Diameter of the spot of a beam at the scanner, and its growth with the range: an LMS 2xx, the widest of the supported
+/// scanners.
+const SPOT_M: f64 = 0.01;
+const SPOT_RAD: f64 = 0.0045;
+/// Minimum width of a surface, such as a leaf of a door, in meters. A narrower straight piece may be legs.
+const FLAT_M: f64 = 0.4;
+/// Standard deviation of points from the line of a surface: the noise of the ranges.
+const FLATNESS_M: f64 = 0.015;
+/// Minimum distance by which the beams next to a free leg reach behind it, in meters. Points of a surface are closer together.
+const FREE_M: f64 = 0.6;
+/// Points between the jambs at which a door is checked, and the distance from the line that a closed leaf may have.
+const CLOSED_POINTS: usize = 9;
+const CLOSED_M: f64 = 0.25;
+/// What is wider is no person.
+const WIDEST_M: f64 = 1.3;
+/// By so much a beam has to end before the farthest that it ever reached, to have met something that stands there.
+const BEFORE_M: f64 = 0.15;
+/// So many scans in a row have to reach farther than any before.
+const SCANS_FARTHER: u8 = 5;
+/// So far around a place are the legs of somebody who stands there.
+const REACH_M: f64 = 0.35;
+
+/// A leg that one sensor sees.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Leg {
+    /// Its middle: a sensor sees the near side, which is corrected.
+    pub(crate) at: Point,
+    /// Standard deviation of each coordinate.
+    pub(crate) sigma_m: f64,
+    /// It stands in front of the background, and is no single beam. What the background has learned is not.
+    pub(crate) is_fresh: bool,
+    /// Whether it is evidence for a person. A leg of a chair is too thin, and a value between two surfaces is nothing at
+    /// all. Both only support a track that other legs have started.
+    pub(crate) is_solid: bool,
+    /// Number of beams that it reflects.
+    pub(crate) beams: usize,
+    /// Whether it is in an ignored area. Such a leg is not fresh.
+    pub(crate) is_ignored: bool,
+    /// Whether the beams on both sides of it reach far behind it. The points of a leaf of a door are next to each other.
+    pub(crate) is_free: bool,
+    /// Position relative to the leaves of doors.
+    pub(crate) at_door: AtDoor,
+}
+
+/// Whether a leg may be a part of a leaf of a door.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
+pub(crate) enum AtDoor {
+    /// No leaf reaches it.
+    Clear,
+    /// A leaf that swings about a jamb reaches it.
+    Swing,
+    /// Between the jambs of a door, on the line along which a leaf may slide.
+    Line,
+    /// On this line, at a jamb or outside the opening, where an open leaf ends.
+    Jamb,
+}
+
+/// What a scan says of a place where somebody may stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Seen {
+    /// Nobody can stand there.
+    Through,
+    /// Something stands there.
+    Here,
+    /// Something nearer hides it, or no beam points there.
+    Hidden,
+}
+
+/// What one sensor sees, and has seen.
+pub(crate) struct Sight {
+    sensor: Sensor,
+    first_angle: f64,
+    step: f64,
+    /// Where each beam points in the map.
+    directions: Vec<Point>,
+    /// Metres; nan: no reading, infinite: nothing came back.
+    ranges: Vec<f64>,
+    /// The farthest that each beam ever reached for some scans: the empty room.
+    farthest: Vec<f64>,
+    /// For how many scans each beam has reached farther, and how far at least.
+    farther: Vec<(u8, f64)>,
+    is_foreground: Vec<bool>,
+    legs: Vec<Leg>,
+    /// Beams that end at something that stands there.
+    standing: Vec<usize>,
+    /// Beams of the cluster that is open, and where they end.
+    points: Vec<(usize, Point)>,
+}
+
+impl Sight {
+    pub(crate) fn new(sensor: Sensor) -> Sight {
+        Sight {
+            sensor,
+            first_angle: 0.0,
+            step: 0.0,
+            directions: Vec::new(),
+            ranges: Vec::new(),
+            farthest: Vec::new(),
+            farther: Vec::new(),
+            is_foreground: Vec::new(),
+            legs: Vec::with_capacity(LEGS),
+            standing: Vec::new(),
+            points: Vec::new(),
+        }
+    }
+
+    /// Takes the next scan and finds the legs in it.
+    pub(crate) fn take(&mut self, scan: &Scan, foreground: &Foreground) {
+        self.fit(scan);
+        let unit_m = f64::from(scan.unit_um) * 1e-6;
+        let beams = self.ranges.iter_mut().zip(&mut self.farthest).zip(&mut self.farther);
+        for (&value, ((range, farthest), farther)) in scan.ranges().iter().zip(beams) {
+            *range = if value <= scan.valid_to {
+                f64::from(value) * unit_m
+            } else if value == scan.no_return || value == scan.beyond {
+                f64::INFINITY
+            } else {
+                f64::NAN
+            };
+            // Most beams end where they always do.
+            if *range > *farthest || farther.0 > 0 {
+                reach(*range, farthest, farther);
+            }
+        }
+        for (direction, &angle) in self.directions.iter_mut().zip(scan.exact_angles()) {
+            if angle.is_finite() {
+                *direction = self.sensor.direction(f64::from(angle));
+            }
+        }
+        self.is_foreground.fill(false);
+        for (beam, _) in foreground.readings() {
+            if let Some(bit) = self.is_foreground.get_mut(beam) {
+                *bit = true;
+            }
+        }
+        self.find_legs();
+    }
+
+    /// All that it sees is off by so much: so is its place.
+    pub(crate) fn shift(&mut self, off: Point) {
+        self.sensor.place = minus(self.sensor.place, off);
+    }
+
+    /// Marks the legs in the ignored areas of `site`, and those that may be leaves of its doors.
+    pub(crate) fn mark(&mut self, site: &Site, has_leaves: &[bool]) {
+        for leg in &mut self.legs {
+            leg.at_door = site.at_door(leg.at, has_leaves);
+            if site.is_ignored(leg.at) {
+                (leg.is_fresh, leg.is_ignored) = (false, true);
+            }
+        }
+    }
+
+    /// Returns whether the opening between two jambs is closed: all beams to it end near the line between them. It is never
+    /// closed if fewer than five beams reach it.
+    pub(crate) fn is_closed(&self, [a, b]: [Point; 2]) -> bool {
+        let ends_there = |i: usize| {
+            let share = (i + 1) as f64 / (CLOSED_POINTS + 1) as f64;
+            let (beam, far) = self.beam([a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])])?;
+            let beam = beam.round() as usize;
+            self.ranges.get(beam).is_some_and(|range| (range - far).abs() <= CLOSED_M).then_some(beam)
+        };
+        // An open door fails at its middle, which is the first point.
+        let order = (0..CLOSED_POINTS).map(|i| (i + CLOSED_POINTS / 2) % CLOSED_POINTS);
+        let (mut first, mut last) = (usize::MAX, 0);
+        for i in order {
+            let Some(beam) = ends_there(i) else { return false };
+            (first, last) = (first.min(beam), last.max(beam));
+        }
+        last - first >= 4
+    }
+
+    pub(crate) fn legs(&self) -> &[Leg] {
+        &self.legs
+    }
+
+    /// What the last scan says of `place`.
+    pub(crate) fn look(&self, place: Point) -> Seen {
+        let Some((middle, far)) = self.beam(place) else { return Seen::Hidden };
+        // Half the width of a person's legs.
+        let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
+        let first = (middle - half).max(0.0) as usize;
+        let last = ((middle + half) as usize).min(self.ranges.len() - 1);
+        let spacing = far * self.step.abs();
+        let (mut through, mut hidden, mut here_run, mut hidden_run) = (0, 0, 0, 0);
+        for (&range, &farthest) in self.ranges[first..=last].iter().zip(&self.farthest[first..=last]) {
+            if range.is_nan() {
+                continue;
+            }
+            let is_here = range > far - REACH_M && range <= far + REACH_M && range < farthest - BEFORE_M;
+            // A person is not as thin as what stands there.
+            let is_through =
+                is_here || range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05);
+            here_run = if is_here { here_run + 1 } else { 0 };
+            if is_here && !is_thin(here_run, spacing) {
+                return Seen::Here;
+            }
+            if is_through {
+                through += 1;
+                // Nor is a person hidden by something thin.
+                hidden += if is_thin(hidden_run, spacing) { 0 } else { hidden_run };
+                hidden_run = 0;
+            } else {
+                hidden_run += 1;
+            }
+        }
+        hidden += hidden_run;
+        let all = through + hidden;
+        if all >= 2 && 5 * through >= 4 * all { Seen::Through } else { Seen::Hidden }
+    }
+
+    /// Returns the beam to `place`, as a fraction of beams, and the distance; `None` if no beam points there.
+    fn beam(&self, place: Point) -> Option<(f64, f64)> {
+        let way = minus(place, self.sensor.place);
+        let far = (way[0] * way[0] + way[1] * way[1]).sqrt();
+        if self.step == 0.0 || far < 0.2 {
+            return None;
+        }
+        let bearing = way[1].atan2(way[0]) - self.sensor.yaw_rad;
+        let angle = if self.sensor.is_upside_down { -bearing } else { bearing };
+        let turned = ((angle - self.first_angle) * self.step.signum() + 1e-9).rem_euclid(TAU);
+        let middle = turned / self.step.abs();
+        (middle < self.ranges.len() as f64).then_some((middle, far))
+    }
+
+    /// Elements for which there is memory.
+    #[cfg(test)]
+    pub(crate) fn capacity(&self) -> usize {
+        let of_beams = self.directions.capacity() + self.ranges.capacity() + self.farthest.capacity();
+        let flags = self.farther.capacity() + self.is_foreground.capacity();
+        of_beams + flags + self.legs.capacity() + self.standing.capacity() + self.points.capacity()
+    }
+
+    /// Makes the tables for scans such as `scan`.
+    fn fit(&mut self, scan: &Scan) {
+        let (shape, count) = ((scan.first_angle, scan.step), scan.beams());
+        if (self.first_angle, self.step) == shape && self.ranges.len() == count {
+            return;
+        }
+        (self.first_angle, self.step) = shape;
+        self.directions.clear();
+        self.directions.extend((0..count).map(|i| self.sensor.direction(shape.0 + i as f64 * shape.1)));
+        for array in [&mut self.ranges, &mut self.farthest] {
+            array.clear();
+            array.resize(count, 0.0);
+        }
+        self.farther.clear();
+        self.farther.resize(count, (0, f64::INFINITY));
+        self.is_foreground.clear();
+        self.is_foreground.resize(count, false);
+        self.standing.reserve(count);
+        self.points.reserve(count);
+    }
+
+    fn find_legs(&mut self) {
+        self.legs.clear();
+        let mut points = std::mem::take(&mut self.points);
+        points.clear();
+        let step = self.step.abs();
+        let beams = self.ranges.iter().zip(&self.farthest).zip(&self.is_foreground).enumerate();
+        let stands = beams.filter(|(_, ((range, farthest), is_foreground))| {
+            range.is_finite() && (**range < **farthest - BEFORE_M || **is_foreground)
+        });
+        let mut standing = std::mem::take(&mut self.standing);
+        standing.clear();
+        standing.extend(stands.map(|(i, _)| i));
+        for &i in &standing {
+            let range = self.ranges[i];
+            let (place, direction) = (self.sensor.place, self.directions[i]);
+            let point = [place[0] + range * direction[0], place[1] + range * direction[1]];
+            if let Some(&(before, last)) = points.last()
+                && (before + 1 != i || distance(last, point) > 0.08 + 1.5 * range * step)
+            {
+                self.close(&points);
+                points.clear();
+            }
+            points.push((i, point));
+        }
+        self.close(&points);
+        (self.points, self.standing) = (points, standing);
+    }
+
+    /// Makes legs of neighbouring points.
+    fn close(&mut self, points: &[(usize, Point)]) {
+        let (Some(&(first, begin)), Some(&(last, end))) = (points.first(), points.last()) else { return };
+        let width = distance(begin, end);
+        if width > WIDEST_M || self.legs.len() == LEGS {
+            return;
+        }
+        if width > WIDEST_LEG_M && points.len() >= 4 {
+            if width > FLAT_M && is_flat(points) {
+                return;
+            }
+            // Between two legs the points lie farther apart than on one.
+            let n = points.len();
+            let within = n / 4 + 1..=3 * n / 4;
+            let cut = within.max_by(|&a, &b| {
+                let gap = |i: usize| distance(points[i - 1].1, points[i].1);
+                gap(a).total_cmp(&gap(b))
+            });
+            if let Some(cut) = cut {
+                self.close(&points[..cut]);
+                self.close(&points[cut..]);
+            }
+            return;
+        }
+        let n = points.len() as f64;
+        let sum = points.iter().fold([0.0, 0.0], |sum, (_, p)| [sum[0] + p[0], sum[1] + p[1]]);
+        let mean = [sum[0] / n, sum[1] / n];
+        let way = minus(mean, self.sensor.place);
+        let range = (way[0] * way[0] + way[1] * way[1]).sqrt().max(0.05);
+        // Mean depth of the near half of a circle whose points lie at even angles.
+        let deeper = LEG_M * FRAC_PI_4 / range;
+        let spacing = range * self.step.abs();
+        let cut_off = |beam: Option<usize>| {
+            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside < range - 0.1)
+        };
+        let is_partial = cut_off(first.checked_sub(1)) || cut_off(Some(last + 1));
+        let is_short = points.len() == 1 && spacing < LEG_M;
+        // A beam that meets two surfaces may report any value between them.
+        let is_between = is_partial && points.len() as f64 <= 1.0 + (SPOT_M + SPOT_RAD * range) / spacing;
+        let is_free = |beam: Option<usize>| {
+            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside > range + FREE_M)
+        };
+        let sigma_m = if is_partial || is_short { 0.07 } else { 0.03 + 0.3 * spacing };
+        let fresh = points.iter().filter(|(beam, _)| self.is_foreground[*beam]).count();
+        self.legs.push(Leg {
+            at: [mean[0] + deeper * way[0], mean[1] + deeper * way[1]],
+            sigma_m,
+            is_fresh: 2 * fresh > points.len() && !is_short,
+            beams: points.len(),
+            is_solid: !is_between && !is_short && (is_partial || !is_thin(points.len(), spacing)),
+            is_ignored: false,
+            is_free: is_free(first.checked_sub(1)) && is_free(Some(last + 1)),
+            at_door: AtDoor::Clear,
+        });
+    }
+}
+
+/// Returns whether a leg reflects more than this number of beams, which are `spacing_m` apart.
+fn is_thin(beams: usize, spacing_m: f64) -> bool {
+    (beams + 1) as f64 * spacing_m < THINNEST_LEG_M
+}
+
+/// Returns whether the points lie on a line, within the noise of the ranges.
+fn is_flat(points: &[(usize, Point)]) -> bool {
+    let n = points.len() as f64;
+    let mean = points.iter().fold([0.0, 0.0], |sum, (_, p)| [sum[0] + p[0] / n, sum[1] + p[1] / n]);
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for (_, point) in points {
+        let [x, y] = minus(*point, mean);
+        (xx, xy, yy) = (xx + x * x / n, xy + x * y / n, yy + y * y / n);
+    }
+    // Variance along the minor axis.
+    let across = (xx + yy) / 2.0 - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
+    across < FLATNESS_M * FLATNESS_M
+}
+
+/// A beam reaches `range`: single readings that are too far are noise.
+fn reach(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
+    if range > *farthest {
+        (*scans, *least) = (*scans + 1, least.min(range));
+        if *scans == SCANS_FARTHER {
+            *farthest = *least;
+            (*scans, *least) = (0, f64::INFINITY);
+        }
+    } else if !range.is_nan() {
+        (*scans, *least) = (0, f64::INFINITY);
+    }
+}

@@ -1,0 +1,176 @@
+//! A scanner on a mount in a simulated hall: points, background and obstacles against what is true there, and angles that
+//! stop, jump, lie and come late.
+
+mod definition;
+#[expect(dead_code, reason = "figures needs more of it")]
+#[path = "../../examples/figures/hall.rs"]
+mod hall;
+#[expect(dead_code, reason = "figures needs more of it")]
+#[path = "../../examples/figures/halls.rs"]
+mod halls;
+#[expect(dead_code, reason = "figures needs more of it")]
+#[path = "../../examples/figures/judge.rs"]
+mod judge;
+
+use hall::Hall;
+use judge::{Score, Seen, seconds};
+use scanhub_perception::tilt::{Settings, Withheld};
+use scanhub_sim::mount::{Fault, FaultKind};
+use scanhub_sim::world::World;
+
+#[test]
+fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
+    let settings = Settings::default();
+    let mut score = Score::default();
+    let mut seen = Seen::default();
+    let counts = Hall::new(&"tilt".parse().expect("built in"), 1).play(settings, 52, |hall, sweep| {
+        seen.add(sweep);
+        let is_known = sweep.from_ns > seconds(10) && sweep.until_ns < seconds(24);
+        assert!(!is_known || sweep.obstacles.is_empty(), "nothing is new yet: {:?}", sweep.obstacles);
+        if sweep.until_ns > seconds(20) {
+            score.add(hall, sweep, &settings, judge::SWEEP_NS);
+        }
+    });
+    assert_eq!(counts.withheld.iter().sum::<u64>() + counts.doubted + counts.forgotten, 0, "{counts:?}");
+    assert!(seen.is_pole_found_at_once(), "{seen:?}");
+    assert!(seen.sweeps_of_pole() >= 4 && seen.sweeps_of_pole() <= 7, "{seen:?}");
+    assert!(seen.sweeps_of_box() >= 4 && seen.sweeps_of_box() <= 7, "{seen:?}");
+    assert!(score.persons.0 > 2000 && score.things.0 > 1000, "{score:?}");
+    assert!(score.recall() > 0.95 && score.precision() > 0.97, "{score:?}");
+}
+
+/// What a fault from 7 to 10 s makes of a room in which nothing is new: what was withheld by reason, and doubted. No obstacle
+/// is invented, no point that is handed out for good is wrong, and afterwards all is as before.
+fn of(kind: FaultKind) -> ([u64; Withheld::COUNT], u64) {
+    let room = "[[thing]]\nline = [[-2500, -1000], [2500, -1000], [2500, 4000], [-2500, 4000], [-2500, -1000]]\n\
+                [[thing]]\nbox = [600, 400]\nheight_mm = 350\npose = [-900, 2200, 35]\n";
+    let mount = "[sensor.mount]\nheight_mm = 900\narm_mm = [60, 40]\nfrom_deg = 0\nto_deg = 30\n";
+    let text = format!("[[sensor]]\npose = [0, 0, 90]\n{mount}[noise]\nbias_mm = 0\n{room}");
+    let settings = Settings { sweeps: 3, ..Settings::default() };
+    let fault = scanhub_sim::mount::Fault { kind, from_s: 7.0, until_s: 10.0 };
+    let world = World::of_toml("room", &text).unwrap_or_else(|failure| panic!("{failure}"));
+    let world = world.with_mount_faults(&[fault]);
+    let mut healthy = 0;
+    let mut hall = Hall::new(&world, 2);
+    let counts = hall.play(settings, 17, |hall, sweep| {
+        let wrong = sweep.points.iter().map(|point| hall.error_m(point)).fold(0.0, f64::max);
+        let [from, until] = [sweep.from_ns, sweep.until_ns].map(|ns| ns as f64 / 1e9);
+        assert!(sweep.is_doubted || wrong < 0.03, "{kind:?}, {from} to {until} s: {wrong} m");
+        assert!(sweep.obstacles.is_empty(), "{kind:?}, {from} to {until} s: {:?}", sweep.obstacles);
+        healthy += u32::from(from > 11.5 && sweep.is_complete && !sweep.is_doubted);
+    });
+    assert!(healthy >= 4, "{kind:?}: {healthy}, {counts:?}");
+    assert_eq!(hall.late_ns, 0, "{kind:?}: the stamps were right");
+    (counts.withheld, counts.doubted)
+}
+
+#[test]
+fn a_mount_that_halts_is_told_and_makes_no_points() {
+    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Halts);
+    assert_eq!([silent, jumped, inconsistent, doubted], [0; 4]);
+    // As long as it stands, and no longer.
+    assert!((35_000..42_000).contains(&standing), "{standing}");
+}
+
+#[test]
+fn an_encoder_that_hangs_is_told_and_makes_no_points() {
+    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Stuck);
+    assert_eq!([silent, inconsistent, doubted], [0; 3]);
+    assert!(standing > 30_000 && jumped > 0, "{standing} {jumped}");
+}
+
+#[test]
+fn a_silent_encoder_is_told_and_makes_no_points() {
+    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Silent);
+    assert_eq!([jumped, inconsistent, standing, doubted], [0; 4]);
+    assert!((35_000..42_000).contains(&silent), "{silent}");
+}
+
+#[test]
+fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_doubted() {
+    for by_deg in [8.0, -3.0] {
+        let ([_, jumped, ..], doubted) = of(FaultKind::Jumps(by_deg));
+        assert!(jumped > 5_000 && doubted > 0, "{by_deg}: {jumped} {doubted}");
+    }
+}
+
+#[test]
+fn an_encoder_that_lies_is_doubted() {
+    for by_deg in [4.0, -2.0] {
+        let (withheld, doubted) = of(FaultKind::Lies(by_deg));
+        assert!(doubted >= 3, "{by_deg}: {withheld:?} {doubted}");
+    }
+}
+
+#[test]
+fn angles_that_come_late_are_waited_for_but_not_for_ever() {
+    let ([silent, others @ ..], doubted) = of(FaultKind::Late(0.2));
+    // When they come in time again, the last late ones come after them.
+    assert!(silent < 4_000 && others == [0; 3] && doubted == 0, "{silent} {others:?} {doubted}");
+    let ([silent, ..], _) = of(FaultKind::Late(1.0));
+    assert!(silent > 20_000, "{silent}");
+}
+
+#[test]
+fn stamps_that_are_late_from_the_start_are_found_and_corrected() {
+    for (seed, by_s) in [(0, 0.03), (1, -0.03), (2, 0.1), (3, 0.01)] {
+        let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
+        let world = halls::unchanging(seed).with_mount_faults(&[fault]);
+        let (mut sweeps, mut most) = (0, 0.0_f64);
+        let mut hall = Hall::new(&world, seed);
+        let counts = hall.play(Settings::default(), 17, |hall, sweep| {
+            if sweep.from_ns > seconds(11) {
+                sweeps += 1;
+                let errors = sweep.points.iter().map(|point| hall.error_m(point));
+                most = errors.fold(most, f64::max);
+            }
+        });
+        assert!((hall.late_ns as f64 / 1e9 - by_s).abs() < 0.001, "{by_s} s: {} ns", hall.late_ns);
+        assert!(sweeps > 1 && most < 0.02, "{by_s} s: {most} m in {sweeps} sweeps");
+        assert_eq!((counts.forgotten, counts.doubted), (1, 0), "{by_s} s: what was learned until then");
+    }
+}
+
+#[test]
+fn stamps_that_get_late_are_corrected_and_the_background_stays() {
+    let fault = Fault { kind: FaultKind::StampsLate(0.03), from_s: 20.0, until_s: f64::INFINITY };
+    let world = halls::unchanging(0).with_mount_faults(&[fault]);
+    let mut known = 0;
+    let mut hall = Hall::new(&world, 0);
+    let counts = hall.play(Settings::default(), 40, |_, sweep| {
+        let is_known =
+            sweep.points.iter().any(|point| point.class == scanhub_perception::tilt::PointClass::Background);
+        known += u32::from(sweep.from_ns > seconds(30) && is_known);
+        assert!(sweep.is_doubted || sweep.obstacles.is_empty(), "{:?}", sweep.obstacles);
+    });
+    assert!((hall.late_ns as f64 / 1e6 - 30.0).abs() < 1.0, "{} ns", hall.late_ns);
+    assert!((1..=5).contains(&counts.doubted) && counts.forgotten == 0 && known > 2, "{counts:?} {known}");
+}
+
+#[test]
+fn boards_narrower_than_the_distance_between_scans_are_no_obstacles() {
+    let mut hall = Hall::new(&halls::unchanging(1), 1);
+    let until_s = 45 * hall.sweep_ns() / seconds(1);
+    hall.play(Settings::default(), until_s, |_, sweep| {
+        assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
+    });
+}
+
+#[test]
+fn a_top_that_level_beams_graze_is_no_obstacle() {
+    let mut hall = Hall::new(&halls::unchanging(41), 41);
+    let until_s = 33 * hall.sweep_ns() / seconds(1);
+    hall.play(Settings::default(), until_s, |_, sweep| {
+        assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
+    });
+}
+
+#[test]
+fn a_check_finds_the_wall_ahead_between_side_walls() {
+    let mut check = scanhub_perception::tilt::Check::default();
+    let mut hall = Hall::new(&"tilt".parse().expect("built in"), 1);
+    hall.play(Settings::default(), 14, |_, sweep| check.take(sweep));
+    let (floor, wall) = (check.floor(&hall.mount).expect("a floor"), check.wall().expect("a wall"));
+    assert!(floor.height_m.abs() < 0.01 && floor.level_rad.abs() < 0.002, "{floor:?}");
+    assert!(wall.distance_m > 2.0 && wall.lean_rad.abs() < 0.004 && wall.points > 2000, "{wall:?}");
+}

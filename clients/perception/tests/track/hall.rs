@@ -1,0 +1,280 @@
+//! A hall with a door at its end, before a scanner at the other end: leaves that slide or swing, people who walk and stand,
+//! and mixed values where a beam meets two surfaces. Virtual time and seeds.
+#![allow(dead_code)] // Every test file takes what it needs.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use scanhub_perception::track::geometry::{Point, distance};
+use scanhub_perception::track::{Event, People, Picture, Site};
+use scanhub_preprocess::background::{Model, Settings};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
+
+/// The hall has 8 m by 6 m, and the lobby behind it 8 m by 4 m. The opening in the wall between them is 1.8 m wide.
+pub(crate) const SITE: &str = r#"
+[[sensor]]
+name = "front"
+pose = { x = 0.0, y = 0.0, yaw = 0.0 }
+[[room]]
+name = "hall"
+polygon = [[0, -4], [6, -4], [6, 4], [0, 4]]
+[[room]]
+name = "lobby"
+polygon = [[6, -4], [10, -4], [10, 4], [6, 4]]
+[[door]]
+name = "entrance"
+from = "lobby"
+to = "hall"
+between = [[6, -0.9], [6, 0.9]]
+"#;
+const WALLS: [[Point; 2]; 7] = [
+    [[0.0, -4.0], [6.0, -4.0]],
+    [[0.0, 4.0], [6.0, 4.0]],
+    [[6.0, -4.0], [6.0, -0.9]],
+    [[6.0, 0.9], [6.0, 4.0]],
+    [[6.0, -4.0], [10.0, -4.0]],
+    [[6.0, 4.0], [10.0, 4.0]],
+    [[10.0, -4.0], [10.0, 4.0]],
+];
+/// Half the width of the opening, which is the width of a leaf, and the way of a leaf that slides.
+const LEAF_M: f64 = 0.9;
+const SLIDE_M: f64 = 0.85;
+/// Time in which a leaf opens or closes.
+const MOVES_S: f64 = 1.5;
+/// Time until the door moves again by itself, if it does.
+const EVERY_S: f64 = 20.0;
+/// Angle that a beam covers, standard deviation of a range, and the share of beams on an edge with a mixed value.
+const BEAM_RAD: f64 = 0.5 * PI / 180.0;
+const NOISE_M: f64 = 0.01;
+const MIXED: f64 = 0.2;
+const LEG_M: f64 = 0.06;
+const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
+
+/// The movement of the two leaves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Leaves {
+    /// Along the wall, in a plane so far behind it.
+    Slide(f64),
+    /// About the two jambs, by a right angle: into the hall, or into the lobby.
+    SwingIn,
+    SwingOut,
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Scanner {
+    pub(crate) step_deg: f64,
+    pub(crate) hz: u64,
+}
+
+pub(crate) const LEAVES: [Leaves; 4] =
+    [Leaves::Slide(0.05), Leaves::Slide(-0.05), Leaves::SwingIn, Leaves::SwingOut];
+pub(crate) const SCANNERS: [Scanner; 4] = [
+    Scanner { step_deg: 0.5, hz: 25 },
+    Scanner { step_deg: 0.5, hz: 10 },
+    Scanner { step_deg: 1.0, hz: 25 },
+    Scanner { step_deg: 1.0, hz: 10 },
+];
+
+impl Leaves {
+    /// Returns the leaves of a door that is open by `share`.
+    fn at(self, share: f64) -> [[Point; 2]; 2] {
+        let (sin, cos) = (share * FRAC_PI_2).sin_cos();
+        [1.0, -1.0].map(|side| match self {
+            Leaves::Slide(behind) => {
+                [share * SLIDE_M, share * SLIDE_M + LEAF_M].map(|y| [6.0 + behind, side * y])
+            }
+            Leaves::SwingIn => [[6.0, side * LEAF_M], [6.0 - LEAF_M * sin, side * LEAF_M * (1.0 - cos)]],
+            Leaves::SwingOut => [[6.0, side * LEAF_M], [6.0 + LEAF_M * sin, side * LEAF_M * (1.0 - cos)]],
+        })
+    }
+}
+
+/// A person who comes at `from_s`, and walks from point to point. At each of them, they stand for some seconds.
+pub(crate) struct Walker {
+    pub(crate) from_s: f64,
+    pub(crate) way: Vec<(Point, f64)>,
+    pub(crate) pace: f64,
+    /// Share of a double step that they are ahead at the start.
+    pub(crate) phase: f64,
+}
+
+impl Walker {
+    /// Returns where the person is, in which direction they look, how far they have walked, and whether they stand; `None`
+    /// before they come and after they have left.
+    pub(crate) fn at(&self, now_s: f64) -> Option<(Point, Point, f64, bool)> {
+        let mut left_s = now_s - self.from_s;
+        let mut walked_m = 0.0;
+        if left_s < 0.0 {
+            return None;
+        }
+        for leg in self.way.windows(2) {
+            let [(from, stands_s), (to, _)] = [leg[0], leg[1]];
+            let far_m = distance(from, to);
+            let ahead = [(to[0] - from[0]) / far_m, (to[1] - from[1]) / far_m];
+            if left_s < stands_s {
+                return Some((from, ahead, walked_m, true));
+            }
+            left_s -= stands_s;
+            let gone_m = left_s * self.pace;
+            if gone_m < far_m {
+                let place = [from[0] + gone_m * ahead[0], from[1] + gone_m * ahead[1]];
+                return Some((place, ahead, walked_m + gone_m, false));
+            }
+            walked_m += far_m;
+            left_s -= far_m / self.pace;
+        }
+        None
+    }
+
+    /// Returns the middles of both legs.
+    fn legs(&self, now_s: f64) -> Option<[Point; 2]> {
+        let (place, [hx, hy], walked_m, stands) = self.at(now_s)?;
+        let stride = if stands { 0.0 } else { 0.25 * (TAU * (self.phase + walked_m / 1.4)).sin() };
+        // No one stands quite still.
+        let sway = if stands { 0.03 * (1.3 * now_s).sin() } else { 0.0 };
+        Some([1.0, -1.0].map(|side| {
+            let (ahead, aside) = (side * stride + sway, side * 0.11 + 0.5 * sway);
+            [place[0] + ahead * hx - aside * hy, place[1] + ahead * hy + aside * hx]
+        }))
+    }
+
+    /// Returns when this person goes through the door, and whether into the hall.
+    pub(crate) fn passages(&self) -> Vec<(f64, bool)> {
+        let mut passages = Vec::new();
+        let mut before: Option<Point> = None;
+        for step in 0..20_000 {
+            let now_s = self.from_s + f64::from(step) * 0.01;
+            let Some((place, ..)) = self.at(now_s) else { break };
+            if let Some(before) = before
+                && (before[0] < 6.0) != (place[0] < 6.0)
+            {
+                passages.push((now_s, place[0] < 6.0));
+            }
+            before = Some(place);
+        }
+        passages
+    }
+}
+
+/// A run of the hall.
+pub(crate) struct Scene<'a> {
+    pub(crate) site: &'a str,
+    pub(crate) leaves: Leaves,
+    pub(crate) scanner: Scanner,
+    /// Position of the scanner, which looks at the wall with the door.
+    pub(crate) at: Point,
+    pub(crate) seed: u64,
+    pub(crate) seconds: u64,
+    /// The door opens every 20 s, although no one is near it.
+    pub(crate) moves: bool,
+    /// Distance of a person from the middle of the door within which it opens, and the time for which it then stays open.
+    pub(crate) opens_m: f64,
+    pub(crate) stays_s: f64,
+    pub(crate) walkers: &'a [Walker],
+}
+
+/// Returns the events in the hall, with their time in seconds.
+pub(crate) fn events(scene: &Scene<'_>) -> Vec<(f64, Event)> {
+    let mut events = Vec::new();
+    run(scene, |picture| {
+        let at_s = |event: &Event| event.wall_ns.saturating_sub(BEGIN_NS) as f64 * 1e-9;
+        events.extend(picture.events.iter().map(|event| (at_s(event), *event)));
+    });
+    events
+}
+
+/// Runs a scene, and passes each picture to `show`.
+pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
+    let Scene { leaves, scanner, walkers, at, .. } = *scene;
+    let from_scanner = |[x, y]: Point| [x - at[0], y - at[1]];
+    let walls = WALLS.map(|wall| wall.map(from_scanner));
+    let mut random = fastrand::Rng::with_seed(scene.seed);
+    let beams = (180.0 / scanner.step_deg) as usize + 1;
+    let step = scanner.step_deg.to_radians();
+    let head = ScanHead {
+        first_angle: -FRAC_PI_2,
+        step,
+        spacing: step as f32,
+        beam_time_ns: 37_037,
+        unit_um: 1000,
+        valid_to: 20_000,
+        no_return: 30_000,
+        beyond: 30_000,
+        ..ScanHead::default()
+    };
+    let edges = |i: usize| {
+        let middle = -FRAC_PI_2 + i as f64 * step;
+        [-BEAM_RAD / 2.0, 0.0, BEAM_RAD / 2.0].map(|off| [(middle + off).cos(), (middle + off).sin()])
+    };
+    let directions: Vec<[Point; 3]> = (0..beams).map(edges).collect();
+    let empty = directions.iter().map(|rays| rays.map(|ray| nearest(ray, walls.iter().enumerate())));
+    let empty: Vec<[(f64, usize); 3]> = empty.collect();
+    let mut model = Model::new(Settings::default(), beams);
+    let mut segmenter = Segmenter::new(Pose::default(), beams);
+    let mut foreground = Foreground::of(beams);
+    let pose = format!("x = {:.2}, y = {:.2}", at[0], at[1]);
+    let site = scene.site.replace("x = 0.0, y = 0.0", &pose);
+    let mut people = People::new(Site::parse("hall.toml", &site).expect("a hall"), 0);
+    let mut words = vec![0; beams];
+    let (mut open, mut until_s, mut next_s) = (0.0_f64, 0.0, EVERY_S);
+    for scan in 0..scene.seconds * scanner.hz {
+        let now_s = scan as f64 / scanner.hz as f64;
+        let near = |walker: &Walker| {
+            walker.at(now_s).is_some_and(|(place, ..)| distance(place, [6.0, 0.0]) < scene.opens_m)
+        };
+        if walkers.iter().any(near) {
+            until_s = now_s + scene.stays_s;
+        } else if scene.moves && now_s >= next_s {
+            (until_s, next_s) = (now_s + MOVES_S + scene.stays_s, next_s + EVERY_S);
+        }
+        let way = 1.0 / (MOVES_S * scanner.hz as f64);
+        open = (open + if now_s < until_s { way } else { -way }).clamp(0.0, 1.0);
+        let both = leaves.at(open).map(|leaf| leaf.map(from_scanner));
+        let legs: Vec<Point> =
+            walkers.iter().filter_map(|walker| walker.legs(now_s)).flatten().map(from_scanner).collect();
+        for ((word, rays), walls) in words.iter_mut().zip(&directions).zip(&empty) {
+            let mut hits = *walls;
+            for (hit, &ray) in hits.iter_mut().zip(rays) {
+                let moved = nearest(ray, both.iter().enumerate());
+                if moved.0 < hit.0 {
+                    *hit = (moved.0, 10 + moved.1);
+                }
+                for (number, leg) in legs.iter().enumerate() {
+                    let along = leg[0] * ray[0] + leg[1] * ray[1];
+                    let depth = LEG_M * LEG_M - (leg[0] * leg[0] + leg[1] * leg[1] - along * along);
+                    if depth > 0.0 && along - depth.sqrt() < hit.0 {
+                        *hit = (along - depth.sqrt(), 20 + number);
+                    }
+                }
+            }
+            let (near, far) = hits.iter().fold((hits[0], hits[0]), |(near, far), &hit| {
+                (if hit.0 < near.0 { hit } else { near }, if hit.0 > far.0 { hit } else { far })
+            });
+            let is_mixed = near.1 != far.1 && far.0 - near.0 > 0.1 && random.f64() < MIXED;
+            let range = if is_mixed { near.0 + (far.0 - near.0) * random.f64() } else { hits[1].0 };
+            let noisy = range + NOISE_M * normal(&mut random);
+            *word = if noisy.is_finite() { (1000.0 * noisy).round() as u16 } else { 30_000 };
+        }
+        let scan = Scan::of(head, &words);
+        model.update(&scan, &mut foreground);
+        segmenter.update(&scan, &mut foreground);
+        people.take(0, BEGIN_NS + (now_s * 1e9) as u64, &scan, &foreground, &mut show);
+    }
+}
+
+/// Returns the range of the nearest wall in a direction from the scanner, and the number of that wall.
+fn nearest<'a>(ray: Point, walls: impl Iterator<Item = (usize, &'a [Point; 2])>) -> (f64, usize) {
+    let meets = |(number, &[a, b]): (usize, &[Point; 2])| {
+        let along = [b[0] - a[0], b[1] - a[1]];
+        let across = ray[0] * along[1] - ray[1] * along[0];
+        let range = (a[0] * along[1] - a[1] * along[0]) / across;
+        let share = (a[0] * ray[1] - a[1] * ray[0]) / across;
+        (range > 1e-6 && (0.0..=1.0).contains(&share)).then_some((range, number))
+    };
+    walls.filter_map(meets).fold((f64::INFINITY, usize::MAX), |a, b| if b.0 < a.0 { b } else { a })
+}
+
+/// Returns a standard normal number.
+fn normal(random: &mut fastrand::Rng) -> f64 {
+    (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
+}
