@@ -3,11 +3,9 @@
 
 #![expect(clippy::disallowed_methods, reason = "limits and periods of real time")]
 
-mod head;
-mod host;
+mod bench;
+mod rotating;
 mod server;
-mod simulator;
-mod unit;
 
 use std::fs;
 use std::os::unix::net::UnixStream;
@@ -28,8 +26,7 @@ use scanhub_sim::options::SimulateOptions;
 use scanhub_sim::simulate;
 use scanhub_sim::simulate::Record;
 
-use host::Host;
-use simulator::{Folder, Simulator};
+use bench::{Folder, Host, Simulator};
 
 /// Limit of every wait. It only bounds a hang.
 const PATIENCE: Duration = Duration::from_secs(60);

@@ -16,7 +16,7 @@ use scanhub_sim::simulate;
 use scanhub_sim::simulate::Record;
 
 use crate::PATIENCE;
-use crate::simulator::Simulator;
+use crate::bench::Simulator;
 
 fn options(scanner: Option<Scanner>) -> SimulateOptions {
     SimulateOptions { ports: vec!["tcp:127.0.0.1:0".into()], scanner, ..SimulateOptions::default() }

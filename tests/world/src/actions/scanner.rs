@@ -93,7 +93,7 @@ fn change_pace(world: &mut World, action: &Action) {
     world.later(action.value("span_ms"), move |world| set(world, 1.0));
 }
 
-/// Something holds the head of a scanner for a while. Scanners without a head that turns ignore the action.
+/// Something holds the head of a scanner for a while. Scanners without a rotating head ignore the action.
 pub(super) const HOLD: Kind =
     Kind { name: "hold", per_minute: 1.0, keys: &[SENSOR, Key::new("span_ms", 50, 5_000)], act: hold_head };
 

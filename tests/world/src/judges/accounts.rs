@@ -11,9 +11,9 @@ use crate::event::{Arrival, Event};
 use crate::remote::{FIRST_NUMBER, Terms};
 use crate::topics::Sample;
 
-/// Judge: the counters of each subscriber are right. By the numbers of its samples, the samples that it took and those that it
-/// is told it missed are the published ones. No sample arrives twice or out of order, and each sample that was sent to a
-/// subscriber was taken or fell out of its queue.
+/// Judge: the counters of each subscriber are right. By their numbers, its taken samples and its missed samples are
+/// together the published ones. No sample arrives twice or out of order, and each sample that was sent to a subscriber
+/// was taken or fell out of its queue.
 #[derive(Default)]
 pub(crate) struct Accounts {
     consumers: BTreeMap<Number, Account>,
@@ -144,13 +144,13 @@ type Key = (u32, u8, u8);
 /// The counters belong to the running listener.
 #[derive(Default)]
 pub(crate) struct RemoteAccounts {
-    /// How many numbers were used up.
+    /// Number of sequence numbers in use.
     numbered: BTreeMap<Key, u32>,
     rows: BTreeMap<Key, Row>,
     /// Datagrams that it took, and those that it refused.
     arrived: u64,
     refused: u64,
-    /// What its account has so far, and in how many rows.
+    /// Sum of the counters so far, and number of their rows.
     counted: u64,
     counted_rows: usize,
     is_over: bool,
@@ -198,7 +198,7 @@ impl Judge for RemoteAccounts {
                 self.arrived += 1;
                 self.refused += 1;
             }
-            // Nothing is counted before the last part is there.
+            // The listener counts a sample when its last part arrives.
             Event::Arrived { outcome: Arrival::Part, .. } => {}
             Event::Arrived { datagram: Some(datagram), outcome, .. } => {
                 self.arrived += 1;
@@ -267,7 +267,7 @@ impl RemoteAccounts {
 }
 
 impl Row {
-    /// A number came; whether it is the first time.
+    /// Takes a number, and returns whether it is new.
     fn take(&mut self, number: u32) -> bool {
         let is_late = self.taken.last().is_some_and(|&last| last > number);
         let is_new = self.taken.insert(number);
@@ -299,7 +299,7 @@ struct OfTopic {
     taken: u64,
     out: u64,
     failed: u64,
-    /// As was announced to the listener last, and as its account has it.
+    /// Replaced samples in the last announcement, and in the counters.
     said: u64,
     replaced: u64,
 }
@@ -375,7 +375,7 @@ impl Judge for RemoteBridge {
                 }
                 of.replaced = row.replaced;
             }
-            // It had its last word; announcements do not tell of themselves.
+            // The last announcement has arrived. Announcements do not count themselves.
             Event::ListenerEnds { .. } if self.is_over => {
                 let topics =
                     self.topics.iter().filter(|((_, topic), of)| topic.is_some() && of.said != of.replaced);

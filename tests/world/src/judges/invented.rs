@@ -22,14 +22,14 @@ pub(crate) struct NothingInvented {
 
 struct OfSensor {
     family: Rc<dyn Family>,
-    /// How often a telegram was sent and not published.
+    /// Number of times that a telegram was sent and not published.
     open: HashMap<u64, u32>,
-    /// What was published and not sent, until the next telegram tells whether bytes that nobody sent came before it: more was
-    /// read than the telegrams have that are known.
+    /// Published units that were not sent. The next telegram decides whether foreign bytes arrived before it, because
+    /// more bytes were read than the known telegrams have.
     strange: Vec<Vec<u8>>,
     /// Place behind the last byte that was read.
     read: u64,
-    /// The last telegrams that the line damaged, and nothing where it brought bytes between two.
+    /// Last telegrams that the line damaged. An empty one stands for foreign bytes between two telegrams.
     damaged: VecDeque<Vec<u8>>,
     /// Place behind the last telegram.
     end: u64,
@@ -107,7 +107,7 @@ impl Judge for NothingInvented {
 }
 
 impl OfSensor {
-    /// Says what is strange and is no mixture of what the line damaged.
+    /// Reports strange units that are not a mixture of damaged telegrams.
     fn judge_strange(&mut self, sensor: usize, say: &mut Say<'_>) {
         for unit in std::mem::take(&mut self.strange) {
             if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
@@ -122,7 +122,7 @@ impl OfSensor {
         self.damaged.push_front(telegram.to_vec());
     }
 
-    /// Takes one of those that were sent and not published, if there is one.
+    /// Takes a telegram that was sent and not published. Returns whether there is one.
     fn take(&mut self, key: u64) -> bool {
         let Entry::Occupied(mut entry) = self.open.entry(key) else { return false };
         *entry.get_mut() -= 1;
@@ -133,7 +133,7 @@ impl OfSensor {
     }
 }
 
-/// So many damaged telegrams are remembered.
+/// Number of damaged telegrams that are kept.
 const REMEMBERED: usize = 4;
 
 /// Judge: the network delivers nothing that the hub did not publish. The listener accepts no datagram that was not sent with
@@ -328,9 +328,9 @@ const SILENT: Nanos = 3_000 * MILLIS;
 #[derive(Default)]
 pub(crate) struct RemoteKeys {
     forged: HashMap<u64, Forgery>,
-    /// What was recorded and sent again.
+    /// Datagrams that were recorded and sent again.
     again: HashSet<u64>,
-    /// What the listener that lives took.
+    /// Datagrams that the running listener accepted.
     taken: HashSet<u64>,
 }
 

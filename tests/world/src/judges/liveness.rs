@@ -136,10 +136,10 @@ struct RemoteSensor {
     soon: Nanos,
     /// Zones come less often than a verdict stands whose period is not known.
     is_slow: bool,
-    /// Since when the hub says what it knows, if it does.
+    /// Time since which the hub has published a known verdict, if it does.
     said_since: Option<Nanos>,
     is_known: bool,
-    /// It was known since all was well.
+    /// Whether the robot knew the verdict after the world healed.
     came: bool,
 }
 
@@ -148,7 +148,7 @@ impl RemoteLiveness {
         let sensor = |of: usize| {
             let (period, _) = setup.sensors[of].times();
             let every = terms.every.get() * period;
-            // A router that comes back with all else is found within so long, and what waited goes out.
+            // Time to find a router that returns when the world heals, and to send the queue.
             let over_router = if terms.are_bridges { RECONNECTED + ROUND } else { 0 };
             let soon = ANNOUNCED + every + period + terms.delay_ns + over_router + SLACK;
             RemoteSensor { soon, is_slow: every > OFTEN, said_since: None, is_known: false, came: false }
@@ -208,7 +208,7 @@ impl RemoteSensor {
     }
 }
 
-/// Zones that are sent at least so often are always known.
+/// Interval of zones up to which their verdict is always known.
 const OFTEN: Nanos = 230 * MILLIS;
 /// Between two announcements.
 const ANNOUNCED: Nanos = 1_000 * MILLIS;

@@ -50,8 +50,9 @@ impl Judge for Bytes {
     }
 }
 
-/// Judge: while the hub runs, it loses no intact telegram. If the port returned all bytes of a telegram as they were sent, while
-/// the hub reported that it streams, the hub publishes the telegram once and in order, unless there was no memory for it.
+/// Judge: a running hub loses no intact telegram. A telegram is due if the port returned all its bytes as they were
+/// sent, while the hub reported that it streams. The hub publishes it once and in order, unless there was no memory
+/// for it.
 pub(crate) struct NothingLost {
     sensors: Vec<OfSensor>,
 }
@@ -335,27 +336,28 @@ pub(crate) struct LostOnLine {
 
 struct HeadOfSensor {
     family: Rc<dyn Family>,
-    /// What was sent and not published yet, one after the other; nothing where the power went off or the scanner was exchanged.
+    /// Packets that were sent and not published yet, in order. An empty one marks a power cycle or an exchange.
     sent: VecDeque<Vec<u8>>,
     /// The last one that was published.
     last: Vec<u8>,
-    /// What the last status of this hub counted, and since nothing was missing for a while: what was told, what is missing, and
-    /// how much may lie between.
+    /// Count in the last status of this hub. The other fields apply since the last agreement: reported packets,
+    /// missing packets, and their allowed difference.
     counted: Option<u64>,
     told: u64,
     missing: u64,
     lenience: u64,
-    /// What was told and missing when the last status came.
+    /// Sum of reported and missing packets at the last status.
     seen: u64,
-    /// Both did not agree then: of what waited while the hub did not run, and of points without a checksum,
-    /// it is seen afterwards only how much was missing.
+    /// Whether both disagreed then. After a stall of the hub, and for points without a checksum, the hub detects the
+    /// number of missing packets later.
     is_open: bool,
-    /// Something came between that nobody can count: another session, a packet that nobody sent. So many statuses say nothing.
+    /// Number of the next statuses that are not checked, after something that cannot be counted: another session, or a
+    /// packet that was not sent.
     unsure: u8,
     /// Packets were not published for lack of memory.
     is_lacking: bool,
     measured_at: Nanos,
-    /// What statuses counted in all.
+    /// Total count of all statuses.
     told_in_all: u64,
 }
 
@@ -424,7 +426,7 @@ impl Judge for LostOnLine {
 }
 
 impl HeadOfSensor {
-    /// After its power was off nobody knows how many there were.
+    /// Takes measured points. After a power cycle, the number of missing packets is unknown.
     fn measure(&mut self, points: &[TruePoint]) {
         let Some(last) = points.last() else { return };
         if last.at_ns > self.measured_at + POWER_OFF {
@@ -434,7 +436,7 @@ impl HeadOfSensor {
     }
 
     fn send(&mut self, unit: &[u8]) {
-        // What a line doubles was sent once.
+        // A packet that the line duplicates was sent once.
         let before = self.sent.back().map_or(&self.last[..], Vec::as_slice);
         if self.family.turns() && before != unit {
             self.sent.push_back(unit.to_vec());
@@ -467,7 +469,7 @@ impl HeadOfSensor {
         self.lenience += if missing > 0 { unmarked + missing / 20 } else { 0 };
     }
 
-    /// What is wrong with what `status` counts.
+    /// Returns the error of the count in `status`.
     fn check(&mut self, status: &Status) -> Result<(), String> {
         let counted = status.counters[Counter::LostOnLine];
         let told = counted.saturating_sub(self.counted.replace(counted).unwrap_or(0));
@@ -493,13 +495,15 @@ impl HeadOfSensor {
     }
 }
 
-/// The status behind what nobody can count, and the one behind that: it may tell what was seen afterwards.
+/// The status after something that cannot be counted, and the next one, which may contain losses that the hub detected
+/// later.
 const UNSURE: u8 = 2;
-/// Where nothing tells what is missing but how many there were in a turn.
+/// Allowed difference if only the number of points per revolution shows a loss.
 const UNMARKED: u64 = 30;
-/// So many are remembered: of the fastest scanner for as long as a tty keeps.
+/// Number of packets that are kept: as many as a tty buffers of the fastest scanner.
 const MOST_SENT: usize = 20_000;
-/// After more the scanner's clock may be another one: 1.5 s of the slowest.
+/// Longest countable gap, in packets: 1.5 s of the slowest scanner. The scanner's clock may have changed in a longer
+/// one.
 const LONGEST_GAP: u64 = 400;
-/// Nobody switches a power off and on sooner.
+/// Minimum duration of a power cycle.
 const POWER_OFF: Nanos = 50 * MILLIS;

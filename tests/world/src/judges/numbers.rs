@@ -82,7 +82,7 @@ pub(crate) struct RemoteNumbers {
 
 #[derive(Default)]
 struct OfTopic {
-    /// What came in time and was not published yet: when it came, and its header.
+    /// Datagrams that arrived in time and are not published yet: time of arrival and header.
     taken: VecDeque<(Nanos, Head)>,
     /// The last one that was published of them.
     last: Option<(Nanos, Head)>,
@@ -129,7 +129,7 @@ impl Judge for RemoteNumbers {
 }
 
 impl OfTopic {
-    /// `header` was published; what is wrong with it.
+    /// Takes a published `header`, and returns its error.
     fn publish(&mut self, header: &Header, begin_ns: u64) -> Result<(), String> {
         let before = self.number.replace(header.topic_seq);
         if header.flags & Flags::REMOTE == 0 || header.stamp_first_ns != header.stamp_last_ns {
@@ -158,7 +158,7 @@ impl OfTopic {
         let steps =
             last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
         if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
-            // One that came earlier by its time tells no period.
+            // A sample with an earlier time of arrival does not define a period.
             let distance_ns = came.checked_sub(last_came).map(|apart| apart / u64::from(steps));
             self.distances_ns.extend(distance_ns.filter(|distance_ns| *distance_ns <= LONGEST));
             if self.distances_ns.len() > KEPT {
@@ -168,7 +168,8 @@ impl OfTopic {
         let mut known: Vec<_> = self.distances_ns.iter().copied().collect();
         known.sort_unstable();
         let period_us = known.get(known.len().saturating_sub(1) / 2).map_or(0, |period_ns| period_ns / 1000);
-        // The first number of a life of the listener is the datagram's; those that are not heard of another gateway count.
+        // The first number of a run of the listener is the datagram's. Datagrams of another gateway that did not
+        // arrive count.
         let due = match (before, steps) {
             (Some(before), Some(steps)) => before + u64::from(steps),
             (Some(before), None) => before + 1 + u64::from(head.sequence),
@@ -186,6 +187,6 @@ impl OfTopic {
     }
 }
 
-/// So many times between two samples tell the period, but none that is longer.
+/// Number of intervals between samples that define the period, and the longest interval that counts.
 const KEPT: usize = 5;
 const LONGEST: Nanos = 2_500 * MILLIS;

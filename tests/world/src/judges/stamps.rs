@@ -143,11 +143,11 @@ const MOST: usize = 256;
 /// sent, and a subscriber to zones need not wait for the marks of the same scan.
 #[derive(Default)]
 pub(crate) struct Prompt {
-    /// When prompt consumers came.
+    /// Times at which prompt subscribers attached.
     came: BTreeMap<Number, Nanos>,
-    /// The topics that consumers follow.
+    /// Topics of the subscribers.
     followed: BTreeMap<Number, (usize, Topic)>,
-    /// For each sensor the number of the telegram of which a sample was sent to somebody who has not been woken for it yet.
+    /// For each sensor, the number of the telegram whose samples have subscribers that are not woken yet.
     asleep: BTreeMap<usize, u64>,
 }
 
@@ -195,5 +195,5 @@ impl Judge for Prompt {
     }
 }
 
-/// Of a machine with processors to spare.
+/// Maximum delay on a machine with idle processors.
 const LATEST: Nanos = 2 * MILLIS;

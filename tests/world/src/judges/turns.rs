@@ -327,7 +327,7 @@ impl OfSensor {
             return;
         }
         if telegram.damage.is_none() {
-            // The line lost all that came between: where nothing else tells, what waits behind it has no time yet.
+            // The line lost all packets between. Without a clock in the packets, the next ones have no time yet.
             if !self.exactness.has_clock && self.arrived_at + LONG_GAP < at {
                 self.begin();
             }
@@ -367,7 +367,7 @@ impl OfSensor {
             return self.sent.contains_key(&key);
         }
         let begin = self.passed.saturating_sub(self.forgotten);
-        // What a line doubles was sent once.
+        // A packet that the line duplicates was sent once.
         let is_last = begin.checked_sub(1).and_then(|last| self.order.get(last)) == Some(&key);
         let ahead = self.order.iter().skip(begin).position(|sent| *sent == key);
         if !is_last && let Some(ahead) = ahead {
@@ -376,7 +376,7 @@ impl OfSensor {
         is_last || ahead.is_some()
     }
 
-    /// The point that `told` is, if it was measured `shift` after what is told, or less than `lenience` beside.
+    /// Returns the measured point of `told` at its time plus `shift`, within `lenience`.
     fn find(&self, told: &Told, shift: i64, lenience: Nanos) -> Option<&Point> {
         let at_ns = told.at_ns.saturating_add_signed(shift);
         let begin = self.points.partition_point(|point| point.truth.at_ns + lenience < at_ns);
@@ -390,7 +390,7 @@ impl OfSensor {
         shift > period as i64 / 2 && told.iter().all(|told| self.find(told, shift, lenience(told)).is_some())
     }
 
-    /// How many points of `told` are where nothing was measured within 5 cm.
+    /// Returns the number of points of `told` without a measurement within 5 cm.
     fn wrong(&self, told: &[Told], shift: i64) -> u64 {
         let exactness = Exactness { angle_deg: 1.0, range_mm: 50.0, ..self.exactness };
         let is_wrong = |told: &&Told| {
@@ -402,8 +402,8 @@ impl OfSensor {
         told.iter().filter(is_wrong).count() as u64
     }
 
-    /// By how much most points were measured later than is told. From turn to turn a head is nearly where it was before: of the
-    /// turns that fit, the one that fits best.
+    /// Returns the time by which most points were measured later than reported. Points repeat nearly from revolution
+    /// to revolution, so the revolution that fits best counts.
     fn shift(&self, told: &[Told]) -> i64 {
         let Some(first) = told.iter().find(|told| told.range_mm.is_some()) else { return 0 };
         let fit = |told: &mut dyn Iterator<Item = &Told>, shift: i64| {
@@ -450,7 +450,7 @@ const POWER_OFF: Nanos = 50 * MILLIS;
 /// What was measured is remembered for so long, and so many packets are.
 const REMEMBERED: Nanos = 12_000 * MILLIS;
 const MOST: usize = 65_536;
-/// A wrong point is where nothing was measured in so long.
+/// Time within which a measurement near a point makes it right.
 const FAR_NS: Nanos = 15 * MILLIS;
 
 /// A point that was measured.
@@ -461,7 +461,7 @@ struct Point {
     turned_deg: f64,
 }
 
-/// What a scan tells of a point.
+/// A point as a scan reports it.
 #[derive(Debug)]
 struct Told {
     at_ns: Nanos,
@@ -481,7 +481,7 @@ fn told(stamp: Nanos, scan: &Scan) -> Vec<Told> {
 }
 
 impl Point {
-    /// Whether it is what is told: a scanner may see nothing where there is something.
+    /// Returns whether this is the reported point. A scanner may get no return from an object.
     fn is(&self, told: &Told, exactness: &Exactness) -> bool {
         let (is_there, most_deg) = match (told.range_mm, self.truth.range_mm) {
             (Some(told), Some(exact)) => {

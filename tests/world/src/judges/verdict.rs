@@ -99,9 +99,9 @@ pub(crate) struct RemoteVerdict {
 struct RemoteSensor {
     /// When something is inside.
     inside: Vec<(Nanos, Nanos)>,
-    /// For so long a robot beside the hub may believe otherwise.
+    /// Time for which a robot next to the hub may accept another verdict.
     bound: Nanos,
-    /// Until when what was published last stands.
+    /// Time until which the last published verdict is valid.
     until: Nanos,
     believed: Verdict,
 }
@@ -165,7 +165,7 @@ impl Judge for RemoteVerdict {
 }
 
 impl RemoteSensor {
-    /// What is believed is as old as it may be. (What a robot stops to believe just now it may have believed until now.)
+    /// Checks that the accepted verdict is still valid. A verdict that the robot drops now was accepted until now.
     fn check(&self, sensor: usize, at: Nanos, say: &mut Say<'_>) {
         if self.believed != Verdict::Unknown && at > self.until {
             let late = (at - self.until) / MILLIS;
@@ -179,7 +179,7 @@ fn is_clear(payload: &[u8]) -> bool {
     zones.unpack(payload) && zones.verdict() == Verdict::Clear
 }
 
-/// What is added to two periods, the least time that a verdict stands, and the longest.
+/// Margin after two periods, and the shortest and the longest validity of a verdict.
 const MARGIN: Nanos = 40 * MILLIS;
 const LEAST: Nanos = 500 * MILLIS;
 const MOST: Nanos = 5_040 * MILLIS;

@@ -180,7 +180,7 @@ const ROOM: usize = 1 << 20;
 /// A subscriber to all topics of all remote sensors.
 pub(super) struct RemoteRobot {
     robot: Robot,
-    /// The sensors' names, what is known of their zones, and what was believed last.
+    /// Names of the sensors, states of their zones, and last accepted verdicts.
     sensors: Vec<(String, ZonesState, Verdict)>,
 }
 
@@ -196,7 +196,7 @@ impl RemoteRobot {
         RemoteRobot { robot, sensors }
     }
 
-    /// When a verdict is too old, if nothing comes.
+    /// Returns the time at which a verdict expires if no sample arrives.
     pub(super) fn next_ns(&self, terms: &Terms, now: Nanos) -> Nanos {
         let left = self.sensors.iter().filter_map(|(_, state, _)| state.left(terms.moment(now)));
         left.min().map_or(Nanos::MAX, |left| now.saturating_add(left.as_nanos() as Nanos))
@@ -235,5 +235,5 @@ fn believe(shared: &Shared, now: Nanos, sensor: usize, believed: &mut Verdict, r
     }
 }
 
-/// What the gateway is called where the listener is.
+/// Name of the gateway on the listener's machine.
 const GATEWAY: &str = "robot1";

@@ -12,7 +12,7 @@ use scanhub_sim::device::Device as _;
 use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
 use scanhub_sim::operating::Operating;
 
-use super::bench::{Bench, machine, make_stream, sensor};
+use super::{Bench, machine, make_stream, sensor};
 
 /// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
 pub(crate) fn plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {

@@ -9,7 +9,7 @@ use scanhub_schema::{Counter, Counters, Family, MICROS, MILLIS, Nanos, Status};
 use scanhub_sim::device::Device;
 use scanhub_sim::rplidar::Model;
 
-use super::bench::{self, Bench, Event, Host};
+use super::{Bench, Event, Host};
 
 /// A host whose result is the first scan.
 pub(crate) struct Auto {
@@ -98,15 +98,15 @@ type Create = Box<dyn Fn(u64) -> Box<dyn Device>>;
 
 fn scanners() -> Vec<(&'static str, Family, Create)> {
     vec![
-        ("lms idle at 9600", Family::Lms, Box::new(|seed| bench::lms(Baud::B9600, false, seed))),
-        ("lms idle at 38400", Family::Lms, Box::new(|seed| bench::lms(Baud::B38400, false, seed))),
-        ("lms streams at 500000", Family::Lms, Box::new(|seed| bench::lms(Baud::B500000, true, seed))),
-        ("lms streams at 38400", Family::Lms, Box::new(|seed| bench::lms(Baud::B38400, true, seed))),
-        ("ld19", Family::Ld, Box::new(|seed| bench::ld(ld::Model::Ld19, seed))),
-        ("stl27l", Family::Ld, Box::new(|seed| bench::ld(ld::Model::Stl27l, seed))),
-        ("a1 idle", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::A1, false, 0, seed))),
-        ("s2 streams", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::S2, true, 0, seed))),
-        ("c1 idle", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::C1, false, 0, seed))),
+        ("lms idle at 9600", Family::Lms, Box::new(|seed| super::lms(Baud::B9600, false, seed))),
+        ("lms idle at 38400", Family::Lms, Box::new(|seed| super::lms(Baud::B38400, false, seed))),
+        ("lms streams at 500000", Family::Lms, Box::new(|seed| super::lms(Baud::B500000, true, seed))),
+        ("lms streams at 38400", Family::Lms, Box::new(|seed| super::lms(Baud::B38400, true, seed))),
+        ("ld19", Family::Ld, Box::new(|seed| super::ld(ld::Model::Ld19, seed))),
+        ("stl27l", Family::Ld, Box::new(|seed| super::ld(ld::Model::Stl27l, seed))),
+        ("a1 idle", Family::Rplidar, Box::new(|seed| super::rplidar(Model::A1, false, 0, seed))),
+        ("s2 streams", Family::Rplidar, Box::new(|seed| super::rplidar(Model::S2, true, 0, seed))),
+        ("c1 idle", Family::Rplidar, Box::new(|seed| super::rplidar(Model::C1, false, 0, seed))),
     ]
 }
 
@@ -139,8 +139,8 @@ fn the_telegrams_of_the_search_reach_the_session() {
     for seed in 0..20 {
         // Each is found by its stream, so it gets no byte before the session begins.
         for (name, device, most_lost) in [
-            ("lms", bench::lms(Baud::B500000, true, seed), 814),
-            ("ld", bench::ld(ld::Model::Ld19, seed), 2 * 47),
+            ("lms", super::lms(Baud::B500000, true, seed), 814),
+            ("ld", super::ld(ld::Model::Ld19, seed), 2 * 47),
         ] {
             let mut bench = open(Some(device), None, seed);
             next_scan(&mut bench, name);
@@ -156,7 +156,7 @@ fn the_telegrams_of_the_search_reach_the_session() {
 
 #[test]
 fn another_scanner_is_found_ten_seconds_after_the_first_one_is_gone() {
-    let mut bench = open(Some(bench::ld(ld::Model::Ld19, 1)), None, 1);
+    let mut bench = open(Some(super::ld(ld::Model::Ld19, 1)), None, 1);
     next_scan(&mut bench, "ld19");
     bench.device = None;
     let gone = bench.now;
@@ -170,7 +170,7 @@ fn another_scanner_is_found_ten_seconds_after_the_first_one_is_gone() {
     status.set_sensor_type("LD19");
     bench.host.session.describe(&mut status);
     assert_eq!(status.sensor_type(), "");
-    bench.device = Some(bench::rplidar(Model::A1, false, 0, 1));
+    bench.device = Some(super::rplidar(Model::A1, false, 0, 1));
     next_scan(&mut bench, "a1");
     assert_eq!(bench.host.session.family(), Some(Family::Rplidar));
     assert_eq!(bench.host.session.memory().map(|memory| memory.family), Some(Family::Rplidar));
@@ -218,7 +218,7 @@ fn beams_that_are_restored_stay_unless_the_rate_is_that_of_another_model() {
             host.session.restore_beams(*model.expect("a model"), restored.beams());
             host
         };
-        let mut bench = Bench::auto(begin, Some(bench::ld(scanner, 1)), Some(memory), 1);
+        let mut bench = Bench::auto(begin, Some(super::ld(scanner, 1)), Some(memory), 1);
         next_scan(&mut bench, scanner.name());
         assert_eq!(bench.host.session.beams(), Some(expected), "{scanner:?} after {restored:?}");
     }
@@ -226,7 +226,7 @@ fn beams_that_are_restored_stay_unless_the_rate_is_that_of_another_model() {
 
 #[test]
 fn a_paused_search_sends_nothing() {
-    let mut bench = open(Some(bench::lms(Baud::B9600, false, 3)), None, 3);
+    let mut bench = open(Some(super::lms(Baud::B9600, false, 3)), None, 3);
     bench.host.session.control(line::Control::Pause, bench.now);
     bench.run(bench.now + 5_000 * MILLIS);
     assert_eq!((bench.host.session.state(), bench.written.len()), (State::Paused, 0));

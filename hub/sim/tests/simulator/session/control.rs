@@ -7,7 +7,7 @@ use scanhub_drivers::lms::variant::Baud;
 use scanhub_schema::{MILLIS, Nanos};
 use scanhub_sim::operating::Operating;
 
-use super::bench::{Bench, make_stream, sensor};
+use super::{Bench, make_stream, sensor};
 
 impl Bench {
     fn control(&mut self, control: Control) {
@@ -156,7 +156,7 @@ fn a_resync_begins_anew_and_is_counted() {
 
 #[test]
 fn a_recording_is_not_controlled() {
-    let wanted = lms::Settings { listen_only: true, ..super::bench::WANTED };
+    let wanted = lms::Settings { listen_only: true, ..super::WANTED };
     let mut machine = sensor(Baud::B500000);
     let begun = make_stream(&mut machine);
     let mut bench = Bench::wanting(wanted, machine, begun);

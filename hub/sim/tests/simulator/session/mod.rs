@@ -1,20 +1,408 @@
-//! The conversation of a session with a simulated sensor, in virtual time: one file per situation.
+//! A session and a simulated scanner at the two ends of a line, in virtual time. Tests define what the line does to bytes; the
+//! bench checks the invariants at every step.
 
-mod adoption;
-pub(crate) mod bench;
 mod control;
-mod figures;
-mod fixed_rate;
-mod installation;
-mod loss;
-mod lost_on_line;
-mod modes;
-mod notices;
+mod losses;
 mod power;
 mod property;
-mod quirks;
-mod rest;
-mod rs232;
 mod start;
-mod stopped;
 mod trouble;
+
+use std::collections::VecDeque;
+
+use scanhub_drivers::line::{Event, KnownRate, Output, Protocol as _, Session as _, State, Values};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use scanhub_drivers::lms::{Session, Settings};
+use scanhub_drivers::{line, lms};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::device::{Device as _, Part};
+use scanhub_sim::fault::{Fault, Faults};
+use scanhub_sim::machine::LmsSimulator;
+use scanhub_sim::operating::Source;
+use scanhub_sim::room::Room;
+use scanhub_sim::wire::{BaudMismatch, Delivery, LineModel};
+use scanhub_sim::{Arrival, machine};
+
+/// Change of a chunk from scanner to host that has left the line at this time.
+pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
+/// Change of the byte with this number from host to scanner. `None` loses it.
+pub(crate) type ToSensor = Box<dyn FnMut(usize, u8) -> Option<u8>>;
+
+/// Both ends, the line, and everything that went over it.
+pub(crate) struct Bench {
+    pub(crate) session: Session,
+    pub(crate) machine: LmsSimulator,
+    /// Faults of the line.
+    pub(crate) wire: LineModel,
+    pub(crate) now: Nanos,
+    pub(crate) to_host: ToHost,
+    pub(crate) to_sensor: ToSensor,
+    /// Bytes that the session said, with the time.
+    pub(crate) said: Vec<(Nanos, u8)>,
+    /// When the sensor got the last byte of a request.
+    pub(crate) asked: Vec<Nanos>,
+    /// Received ACKs and NAKs with their times.
+    pub(crate) acknowledged: Vec<(Nanos, u8)>,
+    /// Number of received bytes outside of telegrams that the scanner did not send.
+    pub(crate) foreign: usize,
+    pub(crate) sent: Vec<Sent>,
+    pub(crate) received: Vec<Received>,
+    /// Every state that was seen, once in a row.
+    pub(crate) states: Vec<State>,
+    port: Baud,
+    /// Size of the input buffer in bytes. As in a tty, bytes beyond it are lost.
+    pub(crate) room: usize,
+    /// Bytes in the input buffer.
+    inbox: VecDeque<u8>,
+    mistuned: BaudMismatch,
+    damaged: bool,
+    fault: Option<Fault>,
+    /// Whether the session streamed since the telegram on the line began.
+    streamed: bool,
+    read: u64,
+    looks: u32,
+    /// Bytes of the current request that have been sent.
+    request: Vec<u8>,
+}
+
+/// A telegram as the sensor sent it.
+#[derive(Clone, Debug)]
+pub(crate) struct Sent {
+    /// When its last byte was through.
+    pub(crate) at: Nanos,
+    pub(crate) telegram: Vec<u8>,
+    pub(crate) is_reply: bool,
+    pub(crate) aborted: bool,
+    /// Whether the line did something to it.
+    pub(crate) damaged: bool,
+    /// Fault that the line applied.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) fault: Option<Fault>,
+    /// Whether the session streamed when it arrived, so that only the line can have lost it.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) streamed: bool,
+}
+
+/// A telegram as the session delivered it.
+#[derive(Clone, Debug)]
+pub(crate) struct Received {
+    pub(crate) at: Nanos,
+    pub(crate) telegram: Vec<u8>,
+    /// Range bits of its values, if it is a scan whose mode was known when it was delivered.
+    pub(crate) range_bits: Option<u8>,
+    /// Reasons why it is suspect; 0 if it is clean.
+    #[allow(dead_code, reason = "for the tests of faults")]
+    pub(crate) reasons: u8,
+    /// Reported time of its first byte.
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) first: Nanos,
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) estimated: bool,
+    /// Reads since the one before it.
+    pub(crate) looks: u32,
+}
+
+/// Settings of the session in all tests of this module.
+pub(crate) const WANTED: Settings = Settings {
+    variant: Variant::HALF,
+    baud: Baud::B500000,
+    listen_only: false,
+    fixed_rate: false,
+    keep_baud: false,
+    mode: None,
+};
+
+/// Creates a scanner in a room, at this rate.
+pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
+    let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
+    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+}
+
+/// Creates a scanner with `settings` in a room.
+pub(crate) fn sensor_with(settings: machine::Settings) -> LmsSimulator {
+    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+}
+
+/// Makes `machine` stream like a previous host, and returns the time.
+pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
+    let mut now = 10 * MILLIS;
+    for &byte in Request::Stream.encode(0).bytes() {
+        now += line_time(1, machine.baud().rate()) + 60 * MICROS;
+        machine.receive(byte, Arrival::at(now));
+    }
+    // The reply is through, and some scans.
+    now += 2_000 * MILLIS;
+    while machine.poll_transmit(now).is_some() {}
+    now
+}
+
+impl Bench {
+    /// Creates a session that starts at `now` of the machine's time, on a line without faults.
+    pub(crate) fn new(machine: LmsSimulator, now: Nanos) -> Bench {
+        Bench::wanting(WANTED, machine, now)
+    }
+
+    /// Like [`Bench::new`], with other settings.
+    pub(crate) fn wanting(wanted: Settings, mut machine: LmsSimulator, now: Nanos) -> Bench {
+        while machine.poll_transmit(now).is_some() {}
+        Bench {
+            session: Session::new(wanted, now),
+            machine,
+            wire: LineModel::new(&Faults::default(), 0),
+            now,
+            to_host: Box::new(|_, bytes| bytes),
+            to_sensor: Box::new(|_, byte| Some(byte)),
+            said: Vec::new(),
+            asked: Vec::new(),
+            acknowledged: Vec::new(),
+            foreign: 0,
+            sent: Vec::new(),
+            received: Vec::new(),
+            states: Vec::new(),
+            port: wanted.baud,
+            room: usize::MAX,
+            inbox: VecDeque::new(),
+            mistuned: BaudMismatch::default(),
+            damaged: false,
+            fault: None,
+            streamed: true,
+            read: 0,
+            looks: 0,
+            request: Vec::new(),
+        }
+    }
+
+    /// Has the session try `baud` first, as a hub does that has found the sensor there before.
+    pub(crate) fn seek_first(&mut self, baud: Baud) {
+        let silent_switches = self.session.silent_switches();
+        self.session.hint_rate(KnownRate { baud: baud.rate(), silent_switches });
+    }
+
+    /// Returns the rate at which the session has found the sensor.
+    pub(crate) fn found_at(&self) -> Option<Baud> {
+        self.session.known_rate().and_then(|known| Baud::of_rate(known.baud))
+    }
+
+    /// Connects this machine to a session with a history, none of whose requests is partly sent.
+    pub(crate) fn adopting(session: Session, machine: LmsSimulator, now: Nanos) -> Bench {
+        let (port, read) = (session.baud(), session.tally().read);
+        Bench { port, read, session, ..Bench::new(machine, now) }
+    }
+
+    /// Runs for `span`.
+    pub(crate) fn run(&mut self, span: Nanos) {
+        let end = self.now + span;
+        while self.now < end {
+            self.step(end);
+        }
+    }
+
+    /// Runs until `is_so`, which must be within `span`; returns the time it took.
+    pub(crate) fn until(&mut self, what: &str, span: Nanos, is_so: impl Fn(&Bench) -> bool) -> Nanos {
+        let begun = self.now;
+        while !is_so(self) {
+            assert!(self.now < begun + span, "not {what} within {} ms: {self}", span / MILLIS);
+            self.step(begun + span);
+        }
+        self.now - begun
+    }
+
+    pub(crate) fn is_streaming(&self) -> bool {
+        self.session.state() == State::Streaming
+    }
+
+    /// Returns the scans that were sent whole and undamaged, with their last byte after `since`.
+    pub(crate) fn intact_scans(&self, since: Nanos) -> Vec<&[u8]> {
+        let intact = |sent: &&Sent| sent.at > since && !(sent.is_reply || sent.aborted || sent.damaged);
+        self.sent.iter().filter(intact).map(|sent| &sent.telegram[..]).collect()
+    }
+
+    /// Returns the scans that were delivered after `since`.
+    pub(crate) fn received_scans(&self, since: Nanos) -> Vec<&[u8]> {
+        self.scans(since).map(|got| &got.telegram[..]).collect()
+    }
+
+    /// Returns scans that were delivered after `since`, with their stamps and reasons.
+    pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &Received> {
+        let is_scan = move |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
+        self.received.iter().filter(is_scan)
+    }
+
+    /// Stops the host for `span`.
+    #[allow(dead_code, reason = "for the tests of stamps")]
+    pub(crate) fn stop(&mut self, span: Nanos) {
+        self.advance(self.now + span);
+    }
+
+    /// One round of the host: everything that the session wants, then a wait, then a read.
+    fn step(&mut self, limit: Nanos) {
+        let (watch, until) = self.drain();
+        self.wait(watch, until.min(limit));
+        if !watch && self.now < until {
+            return;
+        }
+        self.looks += 1;
+        if watch && self.session.can_defer_read() && self.session.defer_read(self.now, self.inbox.len()) {
+            return;
+        }
+        let spare = self.session.spare();
+        let len = spare.len().min(self.inbox.len());
+        for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
+            *place = byte;
+        }
+        self.read += len as u64;
+        self.session.commit(self.now, len);
+        if len == 0 && self.now >= until {
+            self.session.handle_timeout(self.now);
+        }
+    }
+
+    fn drain(&mut self) -> (bool, Nanos) {
+        let wait = loop {
+            match self.session.poll_output() {
+                Output::SetDtr(_) => panic!("there is nothing at this line"),
+                Output::SetRate(baud) => {
+                    self.port = self.session.baud();
+                    assert_eq!(self.port.rate(), baud);
+                    self.damaged |= !self.inbox.is_empty();
+                    self.inbox.clear();
+                }
+                Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
+                    self.transmit(byte, not_before);
+                }
+                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Output::Event(Event::Telegram(received)) => {
+                    let line::Received { bytes, whole, reasons, first, estimated, .. } = received;
+                    let telegram = bytes.to_vec();
+                    let looks = std::mem::take(&mut self.looks);
+                    let range_bits = whole.and_then(|whole| match whole.scan?.values {
+                        Values::Words { range_bits, .. } => Some(range_bits),
+                        Values::Points { .. } => None,
+                    });
+                    let at = self.now;
+                    self.received.push(Received {
+                        at,
+                        telegram,
+                        range_bits,
+                        reasons,
+                        first,
+                        estimated,
+                        looks,
+                    });
+                }
+                Output::Rest(until) => break (false, until),
+                Output::Wait { until, .. } => break (true, until),
+            }
+        };
+        let tally = self.session.tally();
+        let known =
+            tally.in_telegrams + tally.acknowledge + tally.discarded + self.session.account().buffered;
+        assert_eq!((tally.read, known), (self.read, self.read), "bytes vanished");
+        assert_eq!(self.machine.eeprom_writes(), 0);
+        self.streamed &= self.is_streaming();
+        if self.states.last() != Some(&self.session.state()) {
+            self.states.push(self.session.state());
+        }
+        wait
+    }
+
+    /// Waits until `until`, or for bytes if they are watched for.
+    fn wait(&mut self, watch: bool, until: Nanos) {
+        while !watch || self.inbox.is_empty() {
+            match self.wire.poll_timeout(&self.machine, self.now) {
+                Some(at) if at <= until => self.advance(at),
+                _ => break,
+            }
+        }
+        let woken = if watch && !self.inbox.is_empty() { self.now } else { until };
+        self.advance(woken.max(self.now) + WAKE);
+    }
+
+    fn transmit(&mut self, byte: u8, not_before: Nanos) {
+        self.advance(not_before);
+        let byte_ns = line_time(1, self.port.rate());
+        if !self.request.is_empty() {
+            let (last, _) = self.said[self.said.len() - 1];
+            let gap = self.now - last - byte_ns;
+            assert!((55 * MICROS..=6 * MILLIS).contains(&gap), "{gap} ns between two bytes of a request");
+        }
+        self.request.push(byte);
+        let mut is_whole = false;
+        if let [_, _, low, high, ..] = self.request[..]
+            && self.request.len() == usize::from(u16::from_le_bytes([low, high])) + lms::telegram::FRAME
+        {
+            self.request.clear();
+            is_whole = true;
+        }
+        let number = self.said.len();
+        self.said.push((self.now, byte));
+        self.session.transmitted(self.now);
+        self.advance(self.now + byte_ns);
+        if let Some(byte) = (self.to_sensor)(number, byte)
+            && self.machine.baud() == self.port
+        {
+            self.wire.receive(&mut self.machine, byte, Arrival::at(self.now));
+            self.asked.extend(is_whole.then_some(self.now));
+        }
+    }
+
+    /// Advances the time to `to`, unless it is later already.
+    fn advance(&mut self, to: Nanos) {
+        while let Some(at) = self.wire.poll_timeout(&self.machine, self.now).filter(|&at| at <= to) {
+            self.now = self.now.max(at);
+            while let Some(carried) = self.wire.poll_transmit(&mut self.machine, self.now) {
+                self.carry(carried);
+            }
+        }
+        self.now = self.now.max(to);
+    }
+
+    /// Takes the bytes that the line delivers.
+    fn carry(&mut self, carried: Delivery) {
+        if carried.is_telegram() {
+            self.fault = self.fault.or(carried.fault);
+        }
+        let Delivery { bytes: brought, rate, idle_after, part, .. } = carried;
+        let mut bytes = (self.to_host)(self.now, brought.clone());
+        if rate != self.port.rate() {
+            bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);
+        }
+        bytes.truncate(self.room - self.inbox.len());
+        self.damaged |= bytes != brought;
+        self.inbox.extend(bytes);
+        match part {
+            None => self.foreign += brought.len(),
+            Some(Part::Telegram) => {}
+            Some(Part::Acknowledge) => {
+                self.damaged = false;
+                self.acknowledged.extend(brought.first().map(|&byte| (self.now, byte)));
+            }
+            Some(Part::End(scanhub_sim::device::Sent { is_reply, telegram, aborted })) => {
+                let fault = self.fault.take();
+                let damaged = std::mem::take(&mut self.damaged) || fault.is_some();
+                let streams = self.is_streaming();
+                let streamed = std::mem::replace(&mut self.streamed, streams);
+                self.sent.push(Sent { at: self.now, telegram, is_reply, aborted, damaged, fault, streamed });
+            }
+        }
+    }
+}
+
+impl std::fmt::Display for Bench {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Bench { session, now, states, .. } = self;
+        let trouble = session.trouble();
+        write!(
+            f,
+            "at {} us, {:?}: {states:?}, {trouble:?}, {:?}",
+            now / MICROS,
+            session.baud(),
+            session.tally()
+        )
+    }
+}
+
+/// Time from an event to a running host.
+const WAKE: Nanos = 50 * MICROS;

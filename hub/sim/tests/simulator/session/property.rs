@@ -15,7 +15,7 @@ use scanhub_schema::{MILLIS, Nanos, line_time};
 use scanhub_sim::machine::{self, Start};
 use scanhub_sim::operating::Operating;
 
-use super::bench::{Bench, WANTED, sensor_with};
+use super::{Bench, WANTED, sensor_with};
 
 /// A host without manners: reads when it likes, writes when it likes, calls when it likes.
 struct Chaos {

@@ -1,15 +1,17 @@
-//! A sensor that refuses, a line that loses a request or a reply, a stream that stops: the session streams all the same.
+//! Scanners that refuse, overlook or misreply, lines that lose requests or replies, and streams that stop: the session streams
+//! anyway, and reports what a scanner says about itself.
 
 use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::lms;
-use scanhub_drivers::lms::Trouble;
-use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
+use scanhub_drivers::lms::status::Condition;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use scanhub_drivers::lms::{Notice, Trouble};
 use scanhub_schema::MILLIS;
-use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
-use scanhub_sim::operating::Source;
+use scanhub_sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::{Operating, Source};
 use scanhub_sim::room::Room;
 
-use super::bench::{Bench, make_stream, sensor};
+use super::{Bench, ToHost, WANTED, make_stream, sensor, sensor_with};
 
 #[test]
 fn a_refused_variant_streams_as_it_is() {
@@ -180,4 +182,245 @@ fn a_sensor_that_was_swapped_may_have_another_address() {
     bench.until("silent", 2_000 * MILLIS, |bench| !bench.is_streaming());
     bench.until("streaming again", 4_000 * MILLIS, Bench::is_streaming);
     assert_eq!(bench.session.sensor().address, Some(0x82));
+}
+
+/// Sensors with these quirks, idle and streaming at each rate, stream as wanted within `limit` ms.
+fn all_stream(quirks: ProtocolQuirks, seeds: std::ops::Range<u64>, limit: u64) {
+    let mut longest = 0;
+    for seed in seeds {
+        for baud in Baud::ALL {
+            for operating in [Operating::OnRequest, Operating::All, Operating::Partial] {
+                let start = Start::In(operating.clone());
+                let settings = Settings { baud, start, seed, quirks: quirks.clone(), ..Settings::default() };
+                let mut bench = Bench::new(sensor_with(settings), 0);
+                longest = longest.max(bench.until("streaming", limit * MILLIS, Bench::is_streaming));
+                bench.run(1_500 * MILLIS);
+                assert!(bench.is_streaming(), "{seed} {baud:?} {operating:?}: {bench}");
+                assert_eq!(bench.session.sensor().variant, Some(Variant::HALF), "{bench}");
+                assert_eq!(
+                    bench.session.sensor().kind(),
+                    b"LMS200;301063;V02.30",
+                    "{seed} {operating:?}: {bench}"
+                );
+            }
+        }
+    }
+    println!("{quirks:?}: the slowest took {} ms", longest / MILLIS);
+}
+
+#[test]
+fn a_third_of_the_requests_is_overlooked() {
+    all_stream(ProtocolQuirks { overlooks: 0.3, ..ProtocolQuirks::default() }, 0..4, 15_000);
+}
+
+#[test]
+fn a_third_of_the_requests_gets_a_nak() {
+    all_stream(ProtocolQuirks { naks: 0.3, ..ProtocolQuirks::default() }, 0..3, 15_000);
+}
+
+#[test]
+fn replies_come_twice() {
+    all_stream(ProtocolQuirks { doubles: 1.0, ..ProtocolQuirks::default() }, 0..1, 5_000);
+    all_stream(ProtocolQuirks { doubles: 0.5, overlooks: 0.2, ..ProtocolQuirks::default() }, 0..2, 15_000);
+}
+
+#[test]
+fn acknowledgements_and_replies_are_late() {
+    // As late as the listing allows, and later.
+    for late in [52, 100, 300] {
+        let late_ns = late * MILLIS;
+        all_stream(
+            ProtocolQuirks { late_acknowledge_ns: late_ns, ..ProtocolQuirks::default() },
+            0..1,
+            20_000,
+        );
+        all_stream(ProtocolQuirks { late_reply_ns: late_ns, ..ProtocolQuirks::default() }, 0..1, 20_000);
+        all_stream(
+            ProtocolQuirks { late_reply_ns: late_ns, doubles: 0.5, ..ProtocolQuirks::default() },
+            0..1,
+            20_000,
+        );
+    }
+}
+
+#[test]
+fn what_is_refused_is_done_without_or_told() {
+    for (command, trouble) in [(0x3A, None), (0x74, None), (0x3B, Some(Trouble::VariantRefused))] {
+        let variant = if trouble.is_some() { Variant::ALL[0] } else { Variant::HALF };
+        let quirks = ProtocolQuirks { refuses: vec![command], ..ProtocolQuirks::default() };
+        let mut bench = Bench::new(sensor_with(Settings { quirks, variant, ..Settings::default() }), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming(), "{command:02X}: {bench}");
+        assert_eq!(bench.session.trouble(), trouble, "{command:02X}");
+    }
+    // Without 20h there is no stream. The session reports that, and repeats the request at long intervals.
+    let quirks = ProtocolQuirks { refuses: vec![0x20], ..ProtocolQuirks::default() };
+    let mut bench = Bench::new(sensor_with(Settings { quirks, ..Settings::default() }), 0);
+    bench.run(2_000 * MILLIS);
+    assert!(matches!(bench.session.trouble(), Some(Trouble::Refused(_))), "{bench}");
+    let said = bench.said.len();
+    bench.run(60_000 * MILLIS);
+    assert!(bench.said.len() - said < 3_000, "{} bytes said in a minute", bench.said.len() - said);
+    bench.machine.set_quirks(ProtocolQuirks::default());
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    assert_eq!(bench.session.trouble(), None);
+}
+
+#[test]
+fn a_version_s14_streams_but_nobody_knows_its_angles() {
+    for start in [Start::In(Operating::OnRequest), Start::In(Operating::All)] {
+        let type_name = "LMS291;S14063;X01.27 ".into();
+        let (variant, baud) = (Variant::ALL[0], Baud::B500000);
+        let settings = Settings { type_name, variant, baud, start, ..Settings::default() };
+        let wanted = lms::Settings { variant, ..WANTED };
+        let mut bench = Bench::wanting(wanted, sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.received_scans(0).len() > 60, "{bench}");
+        let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
+        assert!(scans.all(|got| got.range_bits.is_none()), "{bench}");
+        assert_eq!(bench.session.trouble(), Some(Trouble::AnglesUnknown));
+    }
+}
+
+#[test]
+fn a_mode_without_ranges_gives_no_scans() {
+    for start in [Start::In(Operating::OnRequest), Start::In(Operating::All)] {
+        let settings = Settings { mode: Mode(0x3F), baud: Baud::B500000, start, ..Settings::default() };
+        let mut bench = Bench::new(sensor_with(settings), 0);
+        bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+        bench.run(1_000 * MILLIS);
+        assert!(bench.is_streaming() && bench.received_scans(0).len() > 30, "{bench}");
+        let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
+        assert!(scans.all(|got| got.range_bits.is_none()), "{bench}");
+        assert_eq!(bench.session.trouble(), Some(Trouble::NoRanges(Mode(0x3F))));
+    }
+}
+
+#[test]
+fn a_stream_of_a_sensor_that_answers_nothing_is_taken() {
+    let quirks = ProtocolQuirks { mute: true, ..ProtocolQuirks::default() };
+    let start = Start::In(Operating::All);
+    let settings = Settings { baud: Baud::B500000, start, quirks, ..Settings::default() };
+    let mut bench = Bench::new(sensor_with(settings), 0);
+    bench.until("streaming", 100 * MILLIS, Bench::is_streaming);
+    bench.run(5_000 * MILLIS);
+    assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
+    assert_eq!(bench.session.trouble(), Some(Trouble::ModeUnknown));
+    // Three questions, five times each; then rarely, because without an answer there are no scans.
+    assert_eq!(bench.said.len(), 15 * 7);
+    bench.run(25_000 * MILLIS);
+    assert!(bench.said.len() <= (15 + 3 * 3) * 7, "{} bytes said", bench.said.len());
+    bench.machine.set_quirks(ProtocolQuirks::default());
+    bench.until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
+    bench.run(500 * MILLIS);
+    assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 0));
+}
+
+#[test]
+fn a_change_of_mode_takes_as_long_as_the_listing_allows() {
+    for late in [1_100, 1_500, 2_900] {
+        let quirks = ProtocolQuirks { late_mode_ns: late * MILLIS, ..ProtocolQuirks::default() };
+        all_stream(quirks, 0..1, 15_000);
+    }
+}
+
+fn streaming(settings: Settings) -> Bench {
+    let mut bench = Bench::new(sensor_with(settings), 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.run(1_000 * MILLIS);
+    assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{bench}");
+    bench
+}
+
+#[test]
+fn a_healthy_sensor_is_known_whole_and_says_nothing() {
+    for (baud, start) in [(Baud::B9600, Operating::OnRequest), (Baud::B500000, Operating::All)] {
+        let bench = streaming(Settings { baud, start: Start::In(start), ..Settings::default() });
+        let known = bench.session.sensor();
+        assert_eq!((known.software(), known.kind()), (&b"V02.30"[..], &b"LMS200;301063;V02.30"[..]));
+        assert_eq!((known.condition, known.defective), (Some(Condition::OK), Some(false)));
+        assert_eq!((known.permanent_baud, known.window_percent), (Some(false), Some(100)));
+        assert!(known.laser_power_percent.is_some());
+        assert_eq!(known.notices().next(), None);
+    }
+}
+
+#[test]
+fn a_dirty_window_and_an_error_are_told() {
+    for (status, pollution_percent, notices) in [
+        (0x11, 100, &[][..]),
+        (0x92, 100, &[Notice::Dirty][..]),
+        (0x10, 60, &[Notice::Dirty][..]),
+        (0x13, 100, &[Notice::Error][..]),
+        (0x94, 20, &[Notice::Fatal, Notice::Dirty][..]),
+    ] {
+        let bench = streaming(Settings { status, pollution_percent, ..Settings::default() });
+        let known = bench.session.sensor();
+        assert!(known.notices().eq(notices.iter().copied()), "{status:02X} {pollution_percent}: {known:?}");
+        assert_eq!(known.window_percent, Some(pollution_percent));
+        assert!(notices.iter().all(|notice| notice.is_fault()));
+    }
+}
+
+#[test]
+fn a_condition_that_comes_and_goes_is_there() {
+    let mut bench = streaming(Settings { baud: Baud::B500000, ..Settings::default() });
+    // A scan with a dirty window now and then.
+    bench.to_host = whole_scans(|count, scan| dirty(scan, count % 5 == 0));
+    bench.until("told", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
+    for _ in 0..200 {
+        bench.run(27 * MILLIS);
+        assert!(bench.session.sensor().notices().eq([Notice::Dirty]), "{bench}");
+    }
+    bench.to_host = Box::new(|_, bytes| bytes);
+    bench.until("forgotten", 10_000 * MILLIS, |bench| bench.session.sensor().notices().next().is_none());
+}
+
+/// Hands over whole scans of 361 beams, as `change` makes them of their number and bytes; the rest of the one on the line is
+/// lost.
+fn whole_scans(change: impl Fn(u32, Vec<u8>) -> Vec<u8> + 'static) -> ToHost {
+    let mut count = 0;
+    let mut held = Vec::new();
+    Box::new(move |_, bytes| {
+        if held.is_empty() && !bytes.starts_with(&[0x02, 0x80, 0xD6, 0x02]) {
+            return Vec::new();
+        }
+        held.extend(bytes);
+        if held.len() < 732 {
+            return Vec::new();
+        }
+        count += 1;
+        change(count, std::mem::take(&mut held))
+    })
+}
+
+/// `scan`, whose sensor complains of its window if it `is_dirty`, with a right checksum.
+fn dirty(mut scan: Vec<u8>, is_dirty: bool) -> Vec<u8> {
+    if is_dirty {
+        scan[729] |= 0x80;
+        let sum = lms::telegram::crc(&scan[..730]).to_le_bytes();
+        scan[730..].copy_from_slice(&sum);
+    }
+    scan
+}
+
+#[test]
+fn on_a_line_that_damages_telegrams_one_complaint_is_none() {
+    let mut bench = streaming(Settings { baud: Baud::B500000, ..Settings::default() });
+    bench.to_host = whole_scans(|count, scan| match count % 4 {
+        0 => scan[..700].to_vec(),
+        _ => dirty(scan, count == 101 || count == 103),
+    });
+    for _ in 0..300 {
+        bench.run(27 * MILLIS);
+        assert_eq!(bench.session.sensor().notices().next(), None, "{bench}");
+    }
+    // A condition that the scanner reports repeatedly counts.
+    bench.to_host = whole_scans(|count, scan| match count % 4 {
+        0 => scan[..700].to_vec(),
+        _ => dirty(scan, true),
+    });
+    bench.until("told", 1_000 * MILLIS, |bench| bench.session.sensor().notices().eq([Notice::Dirty]));
 }

@@ -10,7 +10,7 @@ use scanhub_sim::device::Device as _;
 use scanhub_sim::rplidar::{Model, RplidarSettings, RplidarStart};
 use scanhub_sim::world::World;
 
-use super::bench::{Bench, SECOND};
+use super::{Bench, SECOND};
 
 /// A turn as it was handed out.
 struct Told {

@@ -1,0 +1,398 @@
+//! States of a simulated LMS: other operating modes that a host left behind, power cycles and resets, and quirks.
+
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Password;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::{ACK, NAK, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Unit, Variant};
+use scanhub_lms_configure::eeprom::{PowerOn, Write};
+use scanhub_schema::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_sim::device::Device as _;
+use scanhub_sim::machine::{ProtocolQuirks, Settings, Start};
+use scanhub_sim::operating::Operating;
+use scanhub_sim::{Arrival, Dropped};
+
+use super::{Bench, fast, reply};
+
+/// Returns the telegrams of a scanner in mode `operating` within a second, with the times of their last bytes.
+fn streamed(operating: Operating, settings: Settings) -> Vec<(Nanos, Vec<u8>)> {
+    let code = operating.code();
+    let mut bench = Bench::new(Settings { start: Start::In(operating), ..settings });
+    bench.run_until(1_000 * MILLIS);
+    let sent = bench.sent();
+    assert!(sent.iter().all(|(_, sent)| !sent.is_reply && Telegram::check(&sent.telegram).is_some()));
+    let status = bench.ask(&[0x02, 0, 1, 0, 0x31, 0x15, 0x12]);
+    let at = status.windows(5).position(|five| five == [0x02, 0x80, 0x9A, 0, 0xB1]).expect("a status");
+    assert_eq!(status[at + 12], code);
+    sent.into_iter().map(|(at, sent)| (at, sent.telegram)).collect()
+}
+
+/// Checks that all `telegrams` have this length, this command, and this interval in mirror revolutions.
+fn holds(telegrams: &[(Nanos, Vec<u8>)], command: u8, len: usize, turns: u64) {
+    assert!(telegrams.len() > 3, "{}", telegrams.len());
+    for pair in telegrams.windows(2) {
+        assert_eq!((pair[0].1[4], pair[0].1.len()), (command, len));
+        assert_eq!(pair[1].0 - pair[0].0, turns * MIRROR_TURN);
+    }
+}
+
+#[test]
+fn every_mode_streams_telegrams_of_its_own() {
+    holds(&streamed(Operating::All, fast()), 0xB0, 732, 2);
+    holds(&streamed(Operating::Means(5), fast()), 0xB6, 733, 10);
+    holds(&streamed(Operating::Range(27, 299), fast()), 0xB7, 6 + 1 + 6 + 2 * 273 + 1, 2);
+    holds(&streamed(Operating::MeanRange(2, 1, 181), fast()), 0xBF, 6 + 1 + 7 + 2 * 181 + 1, 4);
+    holds(&streamed(Operating::Fields(1, 100), fast()), 0xBE, 814, 2);
+    holds(&streamed(Operating::Reflectivity(vec![(1, 181)]), fast()), 0xF5, 740, 2);
+    assert!(streamed(Operating::OnRequest, fast()).is_empty());
+    assert!(streamed(Operating::Installation, fast()).is_empty());
+}
+
+#[test]
+fn partial_scans_take_turns() {
+    for (variant, quarters) in
+        [(Variant::ALL[0], &[0u8][..]), (Variant::HALF, &[0, 2]), (Variant::ALL[4], &[0, 1, 2, 3])]
+    {
+        let telegrams = streamed(Operating::Partial, Settings { variant, ..fast() });
+        for (number, (_, telegram)) in telegrams.iter().enumerate() {
+            let measured = Measured::decode(Telegram::check(telegram).unwrap()).expect("values");
+            let quarter = quarters[number % quarters.len()];
+            assert_eq!(measured.partial(), Some(quarter));
+            assert_eq!(measured.count(), if quarter == 0 { 181 } else { 180 });
+        }
+        assert!(telegrams.windows(2).all(|pair| (pair[1].0 - pair[0].0).abs_diff(MIRROR_TURN) <= 40_000));
+    }
+}
+
+#[test]
+fn partial_scans_begin_with_the_first() {
+    let mut bench = Bench::new(fast());
+    bench.ask(Writer::new(0, 0x30).byte(1).finish().bytes());
+    bench.ask(Writer::new(0, 0x20).byte(0x2A).finish().bytes());
+    let sent = bench.sent();
+    let quarters = sent[2..4].iter().map(|(_, sent)| {
+        Measured::decode(Telegram::check(&sent.telegram).unwrap()).and_then(|measured| measured.partial())
+    });
+    assert_eq!(quarters.collect::<Vec<_>>(), [Some(0), Some(2)]);
+}
+
+#[test]
+fn indices_count_mirror_turns_and_telegrams() {
+    let settings = Settings { availability: 2, baud: Baud::B38400, ..fast() };
+    let telegrams = streamed(Operating::All, settings);
+    assert!(telegrams.iter().all(|(_, telegram)| telegram.len() == 734));
+    let indices: Vec<(u8, u8)> = telegrams
+        .iter()
+        .map(|(_, telegram)| Measured::decode(Telegram::check(telegram).unwrap()).unwrap().indices().unwrap())
+        .collect();
+    for pair in indices.windows(2) {
+        assert_eq!(pair[1].1, pair[0].1 + 1);
+        assert_eq!(pair[1].0.wrapping_sub(pair[0].0), 16, "8 scans of 2 turns each");
+    }
+}
+
+#[test]
+fn one_telegram_may_be_asked_for() {
+    let mut bench = Bench::new(Settings { unit: Unit::Cm, ..fast() });
+    for (request, command, len) in [
+        (Writer::new(0, 0x30).byte(1), 0xB0, 732),
+        (Writer::new(0, 0x30).byte(8), 0xB0, 372),
+        (Writer::new(0, 0x36).byte(3), 0xB6, 733),
+        (Writer::new(0, 0x37).word(1).word(361), 0xB7, 736),
+        (Writer::new(0, 0x75).word(1).word(1).word(10), 0xF5, 56),
+        (Writer::new(0, 0x75).byte(1).word(1).word(10), 0x92, 8),
+        (Writer::new(0, 0x37).word(1).word(362), 0x92, 8),
+        (Writer::new(0, 0x3E).word(1).word(101), 0x92, 8),
+        (Writer::new(0, 0x75).word(1).word(1).word(361), 0x92, 8),
+    ] {
+        let answer = bench.ask(request.finish().bytes());
+        assert_eq!((answer[5], answer.len() - 1), (command, len));
+    }
+    // An LMS 211 sees no more than 100 degrees.
+    let type_name = "LMS211;301063;V02.30 ".into();
+    let mut bench = Bench::new(Settings { type_name, variant: Variant::ALL[3], ..fast() });
+    let kept = bench.ask(Writer::new(0, 0x3B).word(180).word(50).finish().bytes());
+    assert_eq!(kept[5..11], [0xBB, 0, 100, 0, 50, 0]);
+}
+
+const BOOT: Nanos = 3_000 * MILLIS;
+
+fn install() -> Vec<u8> {
+    Writer::new(0, 0x20).byte(0).slice(b"SICK_LMS").finish().bytes().to_vec()
+}
+
+#[test]
+fn a_power_cycle_breaks_off_forgets_and_announces_itself() {
+    let mut bench =
+        Bench::new(Settings { start: Start::In(Operating::All), boot_ns: BOOT, unit: Unit::Cm, ..fast() });
+    bench.ask(Request::Variant(Variant::ALL[0]).encode(0).bytes());
+    let next = bench.sent().last().unwrap().0 + 10 * MILLIS;
+    bench.run_until(next);
+    assert!(bench.machine.power_cycle(next), "nothing was on the line");
+    let before = bench.chunks.len();
+    bench.run_until(next + BOOT - 1_000 * MILLIS);
+    assert!(bench.ask(Request::Status.encode(0).bytes()).is_empty(), "heard while it starts");
+    bench.run_until(next + 2 * BOOT);
+    let sent: Vec<_> = bench.sent().into_iter().filter(|(at, _)| *at > next).collect();
+    assert_eq!((sent[0].1.aborted, sent[0].1.is_reply, sent.len()), (true, false, 2));
+    assert_eq!((sent[1].1.telegram[4], sent[1].1.is_reply), (0x90, true));
+    assert!(sent[1].0 >= next + BOOT);
+    let banner = bench.chunks[before..].iter().rev().find(|(_, chunk)| !chunk.bytes.is_empty()).unwrap();
+    assert_eq!((banner.1.rate, bench.machine.baud()), (9_600, Baud::B9600));
+    let answer = bench.ask(Request::Status.encode(0).bytes());
+    let Reply::Status(status) = reply(&answer) else { panic!("no status") };
+    assert_eq!(
+        (status.operating_mode(), status.variant(), status.unit()),
+        (0x25, Some(Variant::HALF), Some(Unit::Cm))
+    );
+    assert!(!bench.machine.power_cycle(bench.now), "an idle line");
+}
+
+#[test]
+fn a_reset_says_that_it_comes_and_that_it_is_over() {
+    let errors = vec![(0x84, 22), (1, 49)];
+    let mut bench = Bench::new(Settings { boot_ns: BOOT, errors, ..fast() });
+    let told = bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12]);
+    assert_eq!(told[5..10], [0xB2, 0x84, 22, 1, 49]);
+    let bytes = bench.ask(&[0x02, 0, 1, 0, 0x10, 0x34, 0x12]);
+    assert_eq!(bytes[..9], [ACK, 0x02, 0x80, 2, 0, 0x91, 0x10, 0x79, 0x30]);
+    assert_eq!(bytes.len(), 9);
+    let before = bench.chunks.len();
+    bench.run_until(bench.now + 2 * BOOT);
+    let banner = bench.bytes_from(before);
+    assert_eq!((Telegram::check(&banner).unwrap().command(), bench.machine.baud()), (0x90, Baud::B9600));
+    assert_eq!(bench.ask(&[0x02, 0, 1, 0, 0x32, 0x16, 0x12])[5..7], [0xB2, 0x10], "faults were not cleared");
+}
+
+#[test]
+fn a_sensor_may_start_with_the_simulation() {
+    let mut bench = Bench::new(Settings { start: Start::PowerOn, boot_ns: BOOT, ..Settings::default() });
+    bench.run_until(BOOT - 1);
+    assert!(bench.chunks.is_empty());
+    bench.run_until(BOOT + 100 * MILLIS);
+    assert_eq!(Telegram::check(&bench.bytes_from(0)).unwrap().command(), 0x90);
+}
+
+#[test]
+fn a_permanent_rate_is_written_in_installation_mode_and_stays() {
+    let mut bench = Bench::new(fast());
+    let keep = Writer::new(0, 0x66).byte(1).finish();
+    assert_eq!(reply(&bench.ask(keep.bytes())), Reply::Refused);
+    bench.ask(&install());
+    assert_eq!(bench.ask(keep.bytes())[5], 0xE6);
+    assert_eq!((bench.machine.eeprom_writes(), bench.machine.operating()), (2, &Operating::Installation));
+    bench.machine.power_cycle(bench.now);
+    bench.run_until(bench.now + 10_000 * MILLIS);
+    assert_eq!((bench.machine.baud(), bench.machine.operating()), (Baud::B500000, &Operating::OnRequest));
+    let status = bench.ask(Request::Status.encode(0).bytes());
+    assert_eq!(status[5 + 119], 1);
+    bench.ask(&install());
+    bench.ask(Writer::new(0, 0x66).byte(0).finish().bytes());
+    bench.machine.power_cycle(bench.now);
+    assert_eq!(bench.machine.baud(), Baud::B9600);
+}
+
+#[test]
+fn a_short_configuration_changes_the_leading_bytes_only() {
+    for (configuration_len, length) in [(34, 0x24), (32, 0x22)] {
+        let mut bench = Bench::new(Settings { configuration_len, availability: 2, ..fast() });
+        let before = bench.ask(Request::Configuration.encode(0).bytes());
+        assert_eq!(before[3], length);
+        bench.ask(&install());
+        let refused = bench.ask(Writer::new(0, 0x77).slice(&[0, 0, 0x70, 0, 2, 0x07]).finish().bytes());
+        assert_eq!(
+            (refused[5], refused[6], &refused[7..]),
+            (0xF7, 0, &[&before[6..before.len() - 2], &refused[refused.len() - 2..]].concat()[..])
+        );
+        let written = bench.ask(Writer::new(0, 0x77).slice(&[20, 0, 0x46]).finish().bytes());
+        assert_eq!((written[6], &written[7..12]), (1, &[20, 0, 0x46, 0, 2][..]));
+        bench.machine.power_cycle(bench.now);
+        bench.run_until(bench.now + 5_000 * MILLIS);
+        let after = bench.ask(Request::Configuration.encode(0).bytes());
+        assert_eq!((after.len(), &after[6..11]), (before.len(), &[20, 0, 0x46, 0, 2][..]));
+    }
+}
+
+#[test]
+fn what_ails_it_is_in_the_status() {
+    let errors = vec![(4, 22)];
+    let mut bench =
+        Bench::new(Settings { status: 0x94, errors, pollution_percent: 60, address: 7, ..fast() });
+    let bytes = bench.ask(Request::Status.encode(7).bytes());
+    let telegram = Telegram::check(&bytes[1..]).unwrap();
+    let Reply::Status(report) = Reply::decode(telegram).unwrap() else { panic!("no status") };
+    assert!(report.is_defective() && telegram.status() == Some(0x94));
+    let word = |at: usize| u16::from_le_bytes([telegram.data()[at - 1], telegram.data()[at]]);
+    assert_eq!((word(19), word(33), word(43), word(57)), (600, 600, 1000, 1000));
+    assert_eq!(telegram.data()[119], 7);
+}
+
+fn with(quirks: ProtocolQuirks) -> Bench {
+    Bench::new(Settings { quirks, ..fast() })
+}
+
+/// Returns the number of 200 type requests whose reply starts with this byte.
+fn answered(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
+    let mut bench = with(quirks);
+    let request = Request::Type.encode(0);
+    (0..200).filter(|_| bench.ask(request.bytes()).first().copied() == first).count()
+}
+
+#[test]
+fn a_share_of_the_requests_is_overlooked_or_refused_by_nak() {
+    let overlooked = answered(ProtocolQuirks { overlooks: 0.3, ..ProtocolQuirks::default() }, None);
+    assert!((40..80).contains(&overlooked), "{overlooked}");
+    let refused = answered(ProtocolQuirks { naks: 0.3, ..ProtocolQuirks::default() }, Some(NAK));
+    assert!((40..80).contains(&refused), "{refused}");
+    assert_eq!(answered(ProtocolQuirks { mute: true, ..ProtocolQuirks::default() }, None), 200);
+}
+
+#[test]
+fn a_command_may_be_refused() {
+    let mut bench = with(ProtocolQuirks { refuses: vec![0x3A], ..ProtocolQuirks::default() });
+    assert_eq!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Refused);
+    assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
+    bench.machine.set_quirks(ProtocolQuirks::default());
+    assert!(matches!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Type(_)));
+}
+
+#[test]
+fn replies_come_twice() {
+    let mut bench = with(ProtocolQuirks { doubles: 1.0, ..ProtocolQuirks::default() });
+    bench.ask(Request::Type.encode(0).bytes());
+    let sent = bench.sent();
+    assert_eq!((sent.len(), &sent[0].1.telegram), (2, &sent[1].1.telegram));
+}
+
+#[test]
+fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
+    let mut bench = with(ProtocolQuirks { late_reply_ns: 800 * MILLIS, ..ProtocolQuirks::default() });
+    assert_eq!(bench.ask(Request::Type.encode(0).bytes()), [ACK]);
+    assert_eq!(bench.ask(Request::Stop.encode(0).bytes())[0], ACK);
+    bench.run_until(bench.now + 2_000 * MILLIS);
+    let commands: Vec<u8> = bench.sent().iter().map(|(_, sent)| sent.telegram[4]).collect();
+    assert_eq!(commands, [0xBA, 0xA0]);
+    let mut bench = with(ProtocolQuirks { late_acknowledge_ns: 300 * MILLIS, ..ProtocolQuirks::default() });
+    bench.say(Request::Type.encode(0).bytes(), 60_000);
+    let asked = bench.now;
+    bench.run_until(asked + 1_000 * MILLIS);
+    assert!(bench.chunks[0].0 >= asked + 300 * MILLIS && bench.chunks[0].1.bytes == [ACK]);
+}
+
+#[test]
+fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
+    let mut bench = with(ProtocolQuirks { late_mode_ns: 2_000 * MILLIS, ..ProtocolQuirks::default() });
+    for request in [Request::Stop, Request::Variant(Variant::ALL[0]), Request::Baud(Baud::B500000)] {
+        assert_eq!(bench.ask(request.encode(0).bytes()), [ACK]);
+        let before = bench.sent().len();
+        bench.run_until(bench.now + 2_000 * MILLIS);
+        assert_eq!(bench.sent().len(), before + 1, "{request:?}");
+    }
+    // A host that does not wait gets a reply, and never receives the confirmation of the change.
+    assert_eq!(bench.ask(Request::Stop.encode(0).bytes()), [ACK]);
+    let before = bench.sent().len();
+    assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
+    bench.run_until(bench.now + 5_000 * MILLIS);
+    assert_eq!(bench.sent().len(), before + 1);
+}
+
+#[test]
+fn writing_the_eeprom_takes_its_time() {
+    let mut bench = with(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
+    assert_eq!(
+        reply(&bench.ask(Request::install(Password::FACTORY).encode(0).bytes())),
+        Reply::Mode { done: true }
+    );
+    for write in [Write::Configuration(&[20, 0]), Write::PowerOn(PowerOn::Baud9600)] {
+        let before = bench.sent().len();
+        assert_eq!(bench.ask(write.encode(0).expect("short enough").bytes()), [ACK]);
+        bench.run_until(bench.now + 5_400 * MILLIS);
+        assert_eq!(bench.sent().len(), before, "{write:?}");
+        bench.run_until(bench.now + 600 * MILLIS);
+        assert_eq!(bench.sent()[before].1.telegram[4], write.command() | 0x80);
+    }
+}
+
+#[test]
+fn a_strict_sensor_does_not_measure_in_installation_mode() {
+    for strict in [false, true] {
+        let mut bench = with(ProtocolQuirks { strict, ..ProtocolQuirks::default() });
+        bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+        let measuring = [
+            Request::Operate(lms::operating::Operating::Means(2)),
+            Request::Operate(lms::operating::Operating::Partial),
+            Request::Values(1),
+            Request::Means(2),
+            Request::Stream,
+        ];
+        for request in measuring {
+            bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
+            let before = bench.sent().len();
+            bench.ask(request.encode(0).bytes());
+            let reply = bench.sent()[before..]
+                .iter()
+                .find(|(_, sent)| sent.is_reply)
+                .map(|(_, sent)| sent.telegram[4]);
+            assert_eq!(reply == Some(0x92), strict, "{request:?}");
+        }
+        bench.ask(Request::Stop.encode(0).bytes());
+        assert_eq!(*bench.machine.operating(), Operating::OnRequest);
+        let bytes = bench.ask(Request::Stream.encode(0).bytes());
+        assert_eq!(bytes[5], 0xA0);
+    }
+}
+
+/// Returns the number of 100 requests that get a reply, each written at once or with 55 us between its bytes.
+fn answered_unspaced(bench: &mut Bench) -> usize {
+    let request = Request::Stop.encode(0);
+    let mut count = 0;
+    for step in [0, 55 * MICROS].repeat(50) {
+        let before = bench.sent().len();
+        for &byte in request.bytes() {
+            bench.run_until(bench.now + step);
+            bench.machine.receive(byte, Arrival::at(bench.now));
+        }
+        bench.run_until(bench.now + 500 * MILLIS);
+        count += bench.sent().len() - before;
+    }
+    count
+}
+
+#[test]
+fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
+    for (baud, line_ns) in
+        [(Baud::B9600, 6 * line_time(1, 9_600)), (Baud::B500000, 6 * line_time(1, 500_000))]
+    {
+        let slow = Settings { baud, ..fast() };
+        let mut bench = Bench::new(slow.clone());
+        assert_eq!(answered_unspaced(&mut bench), 100);
+        assert_eq!(bench.machine.take_dropped(), None);
+        assert!(bench.chunks[0].0 >= line_ns + 2 * MILLIS, "the line carries it first");
+        bench.machine.set_quirks(ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() });
+        assert_eq!(answered_unspaced(&mut bench), 0);
+        assert_eq!(bench.machine.take_dropped(), Some(Dropped::ShortGap));
+        let strict =
+            Settings { quirks: ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() }, ..slow };
+        assert_eq!(answered_unspaced(&mut Bench::new(strict.clone())), 0);
+        assert!(matches!(
+            reply(&Bench::new(strict).ask(Request::Status.encode(0).bytes())),
+            Reply::Status(_)
+        ));
+    }
+}
+
+#[test]
+fn a_sensor_may_think_as_long_each_time() {
+    let mut bench = with(ProtocolQuirks { answer_ns: 60 * MILLIS, ..ProtocolQuirks::default() });
+    for request in [Request::Type, Request::Stop, Request::Variant(Variant::HALF)] {
+        let before = bench.chunks.len();
+        bench.ask(request.encode(0).bytes());
+        let [(acknowledged, _), (replied, chunk), ..] = &bench.chunks[before..] else {
+            panic!("{request:?}")
+        };
+        let line_ns = line_time(chunk.bytes.len(), 500_000);
+        assert_eq!(replied - acknowledged, 60 * MILLIS + line_ns, "{request:?}");
+    }
+}
