@@ -321,8 +321,7 @@ fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64;
     let mut of_step = Square::default();
     add_doubts(&mut of_step, track, found, step, offset);
     let of_step = covariance::turned(&of_step, &track.last);
-    let sum = |i: usize, j: usize| found.own[i][j] + found.of_kept[i][j] + of_step[i][j];
-    std::array::from_fn(|i| std::array::from_fn(|j| sum(i, j)))
+    covariance::sum(&covariance::sum(&found.own, &found.of_kept), &of_step)
 }
 
 /// Adds the causes other than noise to the `covariance` of `step`.

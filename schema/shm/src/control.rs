@@ -7,7 +7,7 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::{client, server};
 use iceoryx2::prelude::ipc::Service;
-use iceoryx2::prelude::{AllocationStrategy, EventId, PortFactory as _};
+use iceoryx2::prelude::{AllocationStrategy, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
@@ -16,7 +16,7 @@ use scanhub_schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, 
 use crate::processes::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
-use crate::wake::{Listener, Notifier, WakeService, listener, take_wakeups};
+use crate::wake::{Listener, Notifier, WakeService, listener, notifier, open_event, take_wakeups};
 
 /// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
 pub struct ControlServer {
@@ -73,7 +73,7 @@ impl ControlServer {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(|error| no_port(&service, &error))?;
-        let (requests, responses) = (listener(&asked)?, notifier(&answered)?);
+        let (requests, responses) = (listener(&asked)?, notifier(&answered, EVENT)?);
         Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
     }
 
@@ -132,17 +132,12 @@ impl ControlClient {
     /// Returns [`Kind::Short`] if there are too many clients at once, or if descriptors are short.
     pub fn open(node: &Node) -> Result<Option<ControlClient>, Failure> {
         check_descriptors(CONTROL_DESCRIPTORS)?;
-        let event = |service: &str| {
-            let service = name(service)?;
-            open(node, &service, node.service_builder(&service).event().open())
-        };
         let service = name(CONTROL)?;
         let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
         let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
-        let Some(asked) = event(CONTROL_REQUEST)? else { return Ok(None) };
-        let Some(answered) = event(CONTROL_RESPONSE)? else { return Ok(None) };
-        let responses = listener(&answered)?;
-        let requests = notifier(&asked)?;
+        let Some(asked) = open_event(node, CONTROL_REQUEST)? else { return Ok(None) };
+        let Some(answered) = open_event(node, CONTROL_RESPONSE)? else { return Ok(None) };
+        let (requests, responses) = (notifier(&asked, EVENT)?, listener(&answered)?);
         let builder = control.client_builder().initial_max_slice_len(REQUEST);
         let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
         let client = builder.create().map_err(|error| match error {
@@ -210,11 +205,6 @@ fn bell(node: &Node, service: &str) -> Result<WakeService, Failure> {
             .open_or_create()
             .map_err(OpenFailure::from)
     })
-}
-
-fn notifier(bell: &WakeService) -> Result<Notifier, Failure> {
-    let builder = bell.notifier_builder().default_event_id(EventId::new(EVENT));
-    builder.create().map_err(|error| no_port(bell.name(), &error))
 }
 
 /// Bytes that are reserved for a request. Most have no model.

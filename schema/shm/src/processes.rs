@@ -142,7 +142,7 @@ impl HubLock {
     /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns
     /// [`Kind::Failed`] if the directory belongs to another user or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
-        Publishing::acquire(root, HUB, "hub").map(HubLock)
+        Publishing::acquire(root, HUB, |pid| held(root, "hub", pid)).map(HubLock)
     }
 
     /// Reports to clients that all topics exist. Until then, [`is_starting`] is true.
@@ -151,8 +151,7 @@ impl HubLock {
     ///
     /// Returns [`Kind::Failed`] if the lock's file cannot be written.
     pub fn report_ready(&self) -> Result<(), Failure> {
-        let Publishing { root, lock, .. } = &self.0;
-        lock.write(root, &format!("{}\n{READY}\n", std::process::id()))
+        self.0.lock.write(&self.0.root, &format!("{}\n{READY}\n", std::process::id()))
     }
 }
 
@@ -169,7 +168,8 @@ impl ListenLock {
     ///
     /// Returns the errors of [`HubLock::acquire`], with another listener instead of another hub.
     pub fn acquire(root: &Path) -> Result<ListenLock, Failure> {
-        Ok(ListenLock { _publishing: Publishing::acquire(root, LISTENER, "listener")? })
+        let publishing = Publishing::acquire(root, LISTENER, |pid| held(root, "listener", pid))?;
+        Ok(ListenLock { _publishing: publishing })
     }
 }
 
@@ -177,8 +177,7 @@ impl ListenLock {
 /// Doorbell and services of the name belong to this process alone. A hub is not necessary.
 #[derive(Debug)]
 pub struct NameLock {
-    root: PathBuf,
-    _lock: FileLock,
+    _publishing: Publishing,
 }
 
 impl NameLock {
@@ -189,8 +188,8 @@ impl NameLock {
     /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the
     /// errors of [`HubLock::acquire`].
     pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
-        let lock = acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid));
-        Ok(NameLock { _lock: lock?, root: root.to_owned() })
+        let publishing = Publishing::acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid))?;
+        Ok(NameLock { _publishing: publishing })
     }
 }
 
@@ -205,49 +204,35 @@ pub fn name_held(name: &str, pid: u32) -> Failure {
     Failure::new(Kind::NameHeld, what, "end it, or choose another name")
 }
 
-impl Drop for NameLock {
-    /// The last publisher removes the names of the shared memory, as `Publishing` does.
-    fn drop(&mut self) {
-        if let Ok(None) = publisher(&self.root) {
-            forget_names(&self.root);
-        }
-    }
-}
-
-/// Lock of a hub or a listener, with the cleanup at its end.
+/// Lock of a process that publishes, with the cleanup at its end.
 #[derive(Debug)]
 struct Publishing {
     root: PathBuf,
-    name: &'static str,
+    name: String,
     lock: FileLock,
 }
 
 impl Publishing {
-    fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
-        let lock = acquire(root, name, |pid| held(root, who, pid))?;
-        Ok(Publishing { lock, root: root.to_owned(), name })
+    /// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's file.
+    /// `held` returns the failure if another process has the lock.
+    fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<Publishing, Failure> {
+        let lock = FileLock::acquire(root, name, held)?;
+        // A reader that finds a process ID relies on the prefix.
+        ensure_prefix(root, &MakingLock::wait(root)?)?;
+        lock.write(root, &format!("{}\n", std::process::id()))?;
+        Ok(Publishing { root: root.to_owned(), name: name.to_owned(), lock })
     }
 }
 
 impl Drop for Publishing {
-    /// The last publisher removes the names while it still has the lock. The next hub chooses other names.
+    /// Removes the names while the lock is still held, if no other process uses them. The next hub chooses other names.
     fn drop(&mut self) {
-        let other = if self.name == HUB { LISTENER } else { HUB };
-        // The holder of the other lock uses the names, or is about to join under them.
-        if let Ok(None) = holder_of(&self.root, other) {
+        // The holder of another lock uses the names, or is about to join under them.
+        let mut others = [HUB, LISTENER].into_iter().filter(|other| *other != self.name);
+        if others.all(|other| matches!(holder_of(&self.root, other), Ok(None))) {
             forget_names(&self.root);
         }
     }
-}
-
-/// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's file.
-/// `held` returns the failure if another process has the lock.
-fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<FileLock, Failure> {
-    let lock = FileLock::acquire(root, name, held)?;
-    // A reader that finds a process ID relies on the prefix.
-    ensure_prefix(root, &MakingLock::wait(root)?)?;
-    lock.write(root, &format!("{}\n", std::process::id()))?;
-    Ok(lock)
 }
 
 /// Returns the process of the hub in the domain in `root`; 0 if the hub has not written its ID yet. `None` if no hub

@@ -48,12 +48,7 @@ impl Waker {
     pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
         let ringer = DoorbellRinger::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
-        let notifier = service
-            .notifier_builder()
-            .default_event_id(EventId::new(Wake::Telegram as usize))
-            .create()
-            .map_err(|error| no_port(service.name(), &error))?;
-        Ok(Waker { ringer, notifier, service })
+        Ok(Waker { ringer, notifier: notifier(&service, Wake::Telegram as usize)?, service })
     }
 
     /// Wakes all threads that sleep at the doorbell word `ring`, with one system call.
@@ -130,8 +125,19 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
 ///
 /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the service has another layout.
 pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
-    let service = name(&Wake::service(sensor))?;
+    open_event(node, &Wake::service(sensor))
+}
+
+/// Returns the event service `service`; `None` if it does not exist.
+pub(crate) fn open_event(node: &Node, service: &str) -> Result<Option<WakeService>, Failure> {
+    let service = name(service)?;
     open(node, &service, node.service_builder(&service).event().open())
+}
+
+/// Returns a notifier of the event whose default event ID is `event`.
+pub(crate) fn notifier(service: &WakeService, event: usize) -> Result<Notifier, Failure> {
+    let builder = service.notifier_builder().default_event_id(EventId::new(event));
+    builder.create().map_err(|error| no_port(service.name(), &error))
 }
 
 /// Returns a listener of the event.

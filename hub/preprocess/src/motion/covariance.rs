@@ -15,8 +15,13 @@ pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
     }
 }
 
+/// Returns a + b.
+pub(super) fn sum(a: &Square, b: &Square) -> Square {
+    std::array::from_fn(|i| std::array::from_fn(|j| a[i][j] + b[i][j]))
+}
+
 /// Returns a b.
-pub(super) fn product(a: &Square, b: &Square) -> Square {
+fn product(a: &Square, b: &Square) -> Square {
     std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
@@ -55,11 +60,10 @@ pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
 /// positions are independent: `of_before` and `own`.
 pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &Rigid) -> Square {
     let (x, y) = (before.turned_back((1.0, 0.0)), before.turned_back((0.0, 1.0)));
-    let back = [[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]];
+    let back = rotation(x, y);
     // Derivatives of the step by the position before it.
     let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
-    let (own, other) = (around(&back, own), around(&by_before, of_before));
-    std::array::from_fn(|i| std::array::from_fn(|j| own[i][j] + other[i][j]))
+    sum(&around(&back, own), &around(&by_before, of_before))
 }
 
 /// Returns the covariance of `first` followed by `next`, whose covariances are `of_first` and `of_next`, as in Smith, Self and
@@ -67,14 +71,17 @@ pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &R
 pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Rigid, next: &Rigid) -> Square {
     let (x, y) = first.turned((next.x, next.y));
     let by_first = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]];
-    let (one, other) = (around(&by_first, of_first), turned(of_next, first));
-    std::array::from_fn(|i| std::array::from_fn(|j| one[i][j] + other[i][j]))
+    sum(&around(&by_first, of_first), &turned(of_next, first))
 }
 
 /// Returns the covariance `m` of a position in the frame of `place`, in the frame that contains `place`.
 pub(super) fn turned(m: &Square, place: &Rigid) -> Square {
-    let (x, y) = (place.turned((1.0, 0.0)), place.turned((0.0, 1.0)));
-    around(&[[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]], m)
+    around(&rotation(place.turned((1.0, 0.0)), place.turned((0.0, 1.0))), m)
+}
+
+/// Returns the rotation that turns the axes to `x` and `y`.
+fn rotation(x: (f64, f64), y: (f64, f64)) -> Square {
+    [[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]]
 }
 
 /// Returns the numbers of `m`, row by row.
