@@ -11,8 +11,8 @@ use crate::{Failure, Kind};
 /// The table of topics. Calls the macro `$each` with its rows: with those of all topics, `links`: with those that a hub
 /// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`Maker`].
 ///
-/// A row is `VARIANT PAYLOAD, name, type, group, pace, ring, waiting, kept: description;`. Its columns are those of
-/// [`Row`]. A payload other than `[u8]` is a type of this crate.
+/// A row is `VARIANT PAYLOAD, name, number, type, group, pace, ring, waiting, kept: description;`. Its columns are those
+/// of [`Row`]. A payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
 ///
@@ -32,41 +32,41 @@ macro_rules! for_each_topic {
     (@rows $($to:tt)*) => {
         $crate::for_each_topic! { $($to)*
             Link {
-                Telegram [u8], telegram, "u8[]", 83, Scan, First, 64, 0:
+                Telegram [u8], telegram, 1, "u8[]", 83, Scan, First, 64, 0:
                     "Bytes of telegrams, including replies.";
-                Scan Scan, scan, "scanhub.Scan.v2", 82, Scan, First, 64, 0:
+                Scan Scan, scan, 2, "scanhub.Scan.v2", 82, Scan, First, 64, 0:
                     "Decoded measurements.";
-                Marks Marks, marks, "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
+                Marks Marks, marks, 3, "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
                     "Reflector marks.";
-                Zones Zones, zones, "scanhub.Zones.v2", 81, Scan, First, 16, 1:
+                Zones Zones, zones, 4, "scanhub.Zones.v2", 81, Scan, First, 16, 1:
                     "Verdicts about zones around the robot.";
-                Foreground Foreground, foreground, "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
+                Foreground Foreground, foreground, 5, "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
                     "Beams in front of the background.";
-                Background Background, background, "scanhub.Background.v2", 82, Change, Last, 4, 1:
+                Background Background, background, 6, "scanhub.Background.v2", 82, Change, Last, 4, 1:
                     "The background model.";
-                Status Status, status, "scanhub.Status.v2", 80, Second, Last, 4, 1:
+                Status Status, status, 7, "scanhub.Status.v2", 80, Second, Last, 4, 1:
                     "State, properties and counters of the link.";
-                Lines Lines, lines, "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
+                Lines Lines, lines, 8, "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
                     "Straight lines and their corners.";
-                Motion Motion, motion, "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
+                Motion Motion, motion, 9, "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
                     "Motion of the robot since the previous scan.";
-                Early Early, early, "scanhub.Early.v2", 81, Change, Early, 16, 0:
+                Early Early, early, 10, "scanhub.Early.v2", 81, Change, Early, 16, 0:
                     "Early warnings from partial telegrams.";
             }
             Tracker {
-                Tracks Tracks, tracks, "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
+                Tracks Tracks, tracks, 11, "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
                     "Positions of people, from a tracker.";
-                Events Event, events, "scanhub.Event.v2", 81, Change, Last, 64, 0:
+                Events Event, events, 12, "scanhub.Event.v2", 81, Change, Last, 64, 0:
                     "Events of people, from a tracker.";
             }
             Mount {
-                Tilt Tilt, tilt, "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
+                Tilt Tilt, tilt, 13, "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
                     "The angle of a mount.";
             }
             Tilted {
-                Cloud Cloud, cloud, "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
+                Cloud Cloud, cloud, 14, "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
                     "Points in three dimensions.";
-                Obstacles Obstacles, obstacles, "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
+                Obstacles Obstacles, obstacles, 15, "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
                     "Obstacles in three dimensions.";
             }
         }
@@ -114,6 +114,8 @@ macro_rules! payload_type {
 pub struct Row {
     /// Name, as in `front/scan`.
     pub name: &'static str,
+    /// Number in datagrams and in C. A new topic gets the next free one, wherever its row is.
+    pub number: u8,
     /// Type of the payload, which is the same in all languages.
     pub payload: &'static str,
     /// Last byte of the topic's multicast group.
@@ -160,7 +162,7 @@ impl Ring {
 }
 
 macro_rules! rows {
-    ($($topic:ident $payload:tt, $name:ident, $kind:literal, $group:literal, $pace:ident,
+    ($($topic:ident $payload:tt, $name:ident, $number:literal, $kind:literal, $group:literal, $pace:ident,
         $ring:ident, $waiting:literal, $kept:literal: $about:literal;)*) => {
         /// A topic that a sensor can have.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -176,6 +178,7 @@ macro_rules! rows {
         /// One row for each of [`Topic::ALL`].
         pub(super) const ROWS: [Row; Topic::ALL.len()] = [$(Row {
             name: stringify!($name),
+            number: $number,
             payload: $kind,
             group: $group,
             pace: Pace::$pace,
@@ -245,7 +248,7 @@ impl Topic {
 
     /// Returns the topic's number in datagrams, from 1.
     pub fn number(self) -> u8 {
-        self as u8 + 1
+        self.row().number
     }
 
     /// Returns the topic with this number.
@@ -451,8 +454,8 @@ mod tests {
         use super::super::{Pace, PayloadLen, Ring, Row};
 
         rows! {
-            Telegram [u8], telegram, "u8[]", 83, Scan, First, 16, 0: "Bytes.";
-            Beat Marks, beat, "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
+            Telegram [u8], telegram, 1, "u8[]", 83, Scan, First, 16, 0: "Bytes.";
+            Beat Marks, beat, 2, "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
         }
     }
 
@@ -474,6 +477,8 @@ mod tests {
         for (number, row) in rows.iter().enumerate() {
             let others = &rows[..number];
             assert!(others.iter().all(|other| other.name != row.name && other.payload != row.payload));
+            assert!(others.iter().all(|other| other.number != row.number));
+            assert!((1..=rows.len()).contains(&row.number.into()), "readers have a table of all numbers");
         }
         assert_eq!(super::Topic::Status.row().group, crate::datagram::Announce::GROUP);
     }

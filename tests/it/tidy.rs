@@ -7,6 +7,7 @@ mod eeprom;
 mod families;
 mod keys;
 mod sources;
+mod topics;
 mod tree;
 mod within;
 mod written;

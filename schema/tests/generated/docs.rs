@@ -6,9 +6,11 @@ use std::fmt::Write as _;
 use scanhub_schema::datagram::Announce;
 use scanhub_schema::{Maker, Topic};
 
-use super::description::{Description, Field, Kind, Layout, first_sentence, lower_first};
+use super::description::{Description, Field, Kind, Layout, Value, first_sentence, lower_first};
 use super::rules::{self, Tail};
 
+/// A field with more values has only their names.
+const MAX_VALUES: usize = 10;
 const HEAD: &str = "| offset | type | field |\n|---|---|---|\n";
 
 /// Returns the tables of the layout, of the layouts in it, and of the elements of its arrays.
@@ -35,9 +37,11 @@ pub(crate) fn tables(description: &Description, layout: &Layout) -> String {
             .map(|((at, count), of)| at + count * of.size);
         inner.extend(element);
     }
+    text += &values(description, layout);
     for layout in inner {
         write!(text, "\n`scanhub.{}.v2`, {} bytes:\n\n{HEAD}", layout.name, layout.size).expect("a String");
         rows(description, layout, &mut text);
+        text += &values(description, layout);
     }
     text + "\n"
 }
@@ -60,26 +64,34 @@ fn rows<'a>(description: &'a Description, layout: &Layout, text: &mut String) ->
     inner
 }
 
+/// Returns name and meaning of a field. Its values are in a table below, unless they are too many.
 fn about(description: &Description, field: &Field) -> String {
-    let values = field.set.as_ref().map_or(String::new(), |set| {
-        let set = &description.sets[set];
-        let values = set.values.iter().map(|value| {
-            let doc = first_sentence(&value.doc);
-            if set.values.len() > 10 || doc.is_empty() {
-                value.name.clone()
-            } else {
-                format!("{} {} ({doc})", value.number, value.name.replace('_', " "))
-            }
-        });
-        values.collect::<Vec<_>>().join(", ")
-    });
-    let doc = field.doc(&values);
+    let set = field.set.as_ref().map(|set| &description.sets[set].values);
+    let names = set.filter(|values| values.len() > MAX_VALUES).into_iter().flatten();
+    let doc = field.doc(&names.map(|value| value.name.as_str()).collect::<Vec<_>>().join(", "));
     if doc == "0." {
         return "0".to_owned();
     }
-    let doc = lower_first(doc.trim_end_matches('.'));
-    let doc = doc.strip_prefix(&format!("{}: ", field.name)).unwrap_or(&doc);
-    format!("`{}`: {doc}", field.name)
+    let doc = doc.replace(": .", ".").replace(": ;", ";");
+    let doc = lower_first(doc.trim_end_matches(['.', ':', ' ']));
+    let more = doc.strip_prefix(&field.name).and_then(|more| more.strip_prefix([':', '.']));
+    match more.unwrap_or(&doc).trim_start() {
+        more if more == field.name => format!("`{}`", field.name),
+        more => format!("`{}`: {}", field.name, lower_first(more)),
+    }
+}
+
+/// Returns the table of the values that fields of the layout can have.
+fn values(description: &Description, layout: &Layout) -> String {
+    let mut text = String::new();
+    for field in &layout.fields {
+        let set = field.set.as_ref().map(|set| &description.sets[set].values);
+        for Value { number, name, doc } in set.filter(|set| set.len() <= MAX_VALUES).into_iter().flatten() {
+            let (name, doc) = (name.replace('_', " "), first_sentence(doc));
+            writeln!(text, "| `{}` | {number} {name} | {doc} |", field.name).expect("a String");
+        }
+    }
+    if text.is_empty() { text } else { format!("\n| field | value | meaning |\n|---|---|---|\n{text}") }
 }
 
 /// Returns the table of the payloads in datagrams.

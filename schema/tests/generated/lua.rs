@@ -6,13 +6,13 @@ use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, first_sentence, snake, upper_first};
 use super::readers::{self, Check, Finite, HEADS, How, Shown, names_of};
-use super::{rules, wrap};
+use super::{rules, topics_by_number, wrap};
 
 const WIDTH: usize = 120;
 
 /// Returns the names of topics and of values.
 pub(crate) fn values(description: &Description) -> String {
-    let topics = ["announce"].into_iter().chain(Topic::ALL.map(Topic::name));
+    let topics = ["announce"].into_iter().chain(topics_by_number().map(Topic::name));
     let mut text = table("TOPICS", "[0] = ", topics.map(str::to_owned));
     for set in readers::enums(description) {
         let first = if set == "Counter" { "" } else { "[0] = " };

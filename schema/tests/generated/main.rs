@@ -32,6 +32,13 @@ use scanhub_schema::limits::TopicLimits;
 
 const COMMAND: &str = "SCANHUB_WRITE=1 cargo test -p scanhub-schema --test generated";
 
+/// Returns all topics in the order of their numbers, which start at 1 and have no gaps.
+fn topics_by_number() -> [Topic; Topic::ALL.len()] {
+    let mut topics = Topic::ALL;
+    topics.sort_by_key(|topic| topic.number());
+    topics
+}
+
 /// Compares the file with `text`, or writes it.
 fn check(path: &str, text: &str) {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);

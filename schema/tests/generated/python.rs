@@ -6,7 +6,7 @@ use scanhub_schema::Topic;
 
 use super::description::{Description, Field, Kind, Layout, upper_first};
 use super::readers::{self, Check, HEADS, How, Shown, layouts, names_of};
-use super::{rules, wrap};
+use super::{rules, topics_by_number, wrap};
 
 const WIDTH: usize = 120;
 
@@ -60,9 +60,9 @@ fn array_name(field: &Field) -> String {
 
 /// Returns the names and groups of topics, and the names of values.
 pub(crate) fn constants(description: &Description) -> String {
-    let topics = ["announce"].into_iter().chain(Topic::ALL.map(Topic::name));
+    let topics = ["announce"].into_iter().chain(topics_by_number().map(Topic::name));
     let mut text = tuple("TOPICS", topics.map(str::to_owned));
-    let groups = Topic::ALL.map(|topic| topic.row().group);
+    let groups = topics_by_number().map(|topic| topic.row().group);
     let groups = [scanhub_schema::datagram::Announce::GROUP].into_iter().chain(groups);
     text +=
         &format!("_GROUPS = ({})\n", groups.map(|group| group.to_string()).collect::<Vec<_>>().join(", "));

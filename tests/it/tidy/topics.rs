@@ -1,0 +1,89 @@
+//! Number of files that name a topic. Topic `motion` stands for all: a hub publishes it for each link, and no client uses it
+//! but to show it.
+
+use super::holds;
+use super::tree::{Tree, code};
+
+/// Files that a topic touches, each with the reason. `docs/design.md` has the same list.
+const TOUCHED: [&str; 6] = [
+    // Its row in the table of topics.
+    "schema/src/topic.rs",
+    // Its payload.
+    "schema/src/motion.rs",
+    // The module with the payload.
+    "schema/src/lib.rs",
+    // Its sample, which is filled and sent.
+    "hub/daemon/src/link_output.rs",
+    // Its lines as JSON and as text.
+    "clients/verbs/src/json/processed.rs",
+    "clients/verbs/src/text/processed.rs",
+];
+
+/// Other files that name this topic for a reason that not every topic has.
+const ALSO: [&str; 3] = [
+    // The processor that computes it. `keys.rs` counts the files of a processor.
+    "hub/preprocess/",
+    "hub/daemon/src/pipeline.rs",
+    // A gateway sends it only on request.
+    "clients/verbs/src/forward/selection.rs",
+];
+
+/// Product files that name the topic, and are neither pages nor generated. The Python package reads shared memory on its own.
+fn naming(tree: &Tree) -> Vec<&str> {
+    const OTHERS: [&str; 3] = ["clients/python/", "schema/src/file/layout.txt", "hub/sim/src/rplidar.rs"];
+    let is_product = |path: &str| {
+        ["hub/", "clients/", "schema/"].iter().any(|top| path.starts_with(top))
+            && !path.contains("tests")
+            && !OTHERS.iter().any(|other| path.starts_with(other))
+    };
+    let is_word =
+        |line: &str| line.split(|c: char| !c.is_alphanumeric() && c != '_').any(|word| word == "Motion");
+    let names_it =
+        |line: &str| is_word(line) || line.contains("publishers.motion") || line.contains("crate::motion::*");
+    let sources = tree.files(".rs").filter(|(path, _)| is_product(path));
+    sources.filter(|(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path).collect()
+}
+
+/// Files that name the topic and may not.
+fn few_files_name_a_topic(tree: &Tree) -> Vec<String> {
+    let may = |path: &str| TOUCHED.contains(&path) || ALSO.iter().any(|also| path.starts_with(also));
+    let others = naming(tree).into_iter().filter(|path| !may(path));
+    let ask = "a topic is to touch no further file: derive this from the table of topics (`for_each_topic!`)";
+    others.map(|path| format!("{path} names topic motion, but {ask}")).collect()
+}
+
+/// Files of the list that `docs/design.md` does not mention under "A topic".
+fn the_page_lists_the_files_of_a_topic(tree: &Tree) -> Vec<String> {
+    let page = tree.text("docs/design.md");
+    let entry = page.split("- **A topic**").nth(1).unwrap_or_default();
+    let entry = entry.split("\n- ").next().unwrap_or_default().split("\n## ").next().unwrap_or_default();
+    let missing = TOUCHED.iter().filter(|path| !entry.contains(&format!("`{path}`")));
+    missing.map(|path| format!("docs/design.md does not say that a topic touches {path}")).collect()
+}
+
+#[test]
+fn a_topic_is_in_few_files() {
+    holds(few_files_name_a_topic, |tree| {
+        vec![
+            tree.with("hub/daemon/src/topics.rs", "//! Topics.\nif topic == Topic::Motion {\n"),
+            tree.with("schema/src/datagram/payload.rs", "//! Payloads.\nimpl Packed for Motion {\n"),
+            tree.with("clients/client/src/lib.rs", "//! Client.\npub use scanhub_schema::{Marks, Motion};\n"),
+            tree.with("hub/daemon/src/link.rs", "//! A link.\ntopics.publishers.motion.prepare();\n"),
+        ]
+    });
+    let tree = Tree::load();
+    let naming = naming(&tree);
+    for path in TOUCHED {
+        assert!(naming.contains(&path), "{path} does not name topic motion: it need not be in the list");
+    }
+}
+
+#[test]
+fn the_design_says_which_files_a_topic_touches() {
+    holds(the_page_lists_the_files_of_a_topic, |tree| {
+        vec![tree.with(
+            "docs/design.md",
+            &tree.text("docs/design.md").replace("`schema/src/topic.rs`", "the table"),
+        )]
+    });
+}
