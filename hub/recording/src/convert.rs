@@ -4,8 +4,7 @@
 mod scans;
 mod writers;
 
-use std::cell::Cell;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, IntoInnerError, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -161,16 +160,37 @@ pub fn convert(
             damage: contents.damage,
             is_closed: false,
         },
-        is_closed: Cell::new(false),
     };
     let mut file = BufWriter::with_capacity(BUFFER, output);
     let written = conversion.write(target, &mut file);
-    let failed = |error| conversion.failed(error);
-    let flushed = written.and_then(|()| file.flush().map_err(failed));
-    match flushed.and_then(|()| file.into_inner().map_err(|error| failed(error.into_error()))) {
-        Err(_) if conversion.is_closed.get() => Ok(Converted { is_closed: true, ..conversion.converted }),
-        Err(failure) => Err(failure),
-        Ok(output) => output.commit().map(|()| conversion.converted),
+    let written = written.and_then(|()| Ok(file.into_inner().map_err(IntoInnerError::into_error)?));
+    let converted = conversion.converted;
+    match written {
+        Ok(output) => output.commit().map(|()| converted),
+        Err(Ended::Unwritable(error)) if Output::is_closed(&options.output, &error) => {
+            Ok(Converted { is_closed: true, ..converted })
+        }
+        Err(Ended::Unwritable(error)) => Err(unwritable(&options.output, &error)),
+        Err(Ended::Failed(failure)) => Err(failure),
+    }
+}
+
+/// Reason why a conversion ended early.
+enum Ended {
+    /// The output cannot be written.
+    Unwritable(io::Error),
+    Failed(Failure),
+}
+
+impl From<io::Error> for Ended {
+    fn from(error: io::Error) -> Ended {
+        Ended::Unwritable(error)
+    }
+}
+
+impl From<Failure> for Ended {
+    fn from(failure: Failure) -> Ended {
+        Ended::Failed(failure)
     }
 }
 
@@ -188,13 +208,11 @@ struct Conversion<'a> {
     /// Time of the first telegram.
     first_ns: Option<u64>,
     converted: Converted,
-    /// Whether an error means that the reader of stdout closed it.
-    is_closed: Cell<bool>,
 }
 
 impl Conversion<'_> {
     /// Writes the recording into `file` in the format `target`.
-    fn write(&mut self, target: Target, file: &mut impl Write) -> Result<(), Failure> {
+    fn write(&mut self, target: Target, file: &mut impl Write) -> Result<(), Ended> {
         let options = self.options;
         let &ConvertOptions { meters, intensities, .. } = options;
         match target {
@@ -203,7 +221,7 @@ impl Conversion<'_> {
             }
             Target::Recording(Form::Mcap) => writers::write_mcap(self, file),
             Target::Ros2 => {
-                let sink = Ros2::begin(self, file).map_err(|error| self.failed(error))?;
+                let sink = Ros2::begin(self, file)?;
                 writers::write_scans(self, sink)
             }
             Target::Csv => {
@@ -225,7 +243,7 @@ impl Conversion<'_> {
     /// # Errors
     ///
     /// Returns [`Kind::Interrupted`] if the conversion was stopped.
-    fn count(&mut self, written: Written, at_ns: Option<u64>) -> Result<(), Failure> {
+    fn count(&mut self, written: Written, at_ns: Option<u64>) -> Result<(), Ended> {
         let converted = &mut self.converted;
         if let Some(at_ns) = at_ns.filter(|_| !matches!(written, Written::Added | Written::LeftOut)) {
             let since_ns = at_ns.saturating_sub(*self.first_ns.get_or_insert(at_ns));
@@ -239,15 +257,9 @@ impl Conversion<'_> {
             (self.progress)(self.done, self.recording.contents().telegrams);
         }
         if self.stop.load(Ordering::Relaxed) {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before the end", ""));
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the end", "").into());
         }
         Ok(())
-    }
-
-    /// Returns the failure of the output after `error`.
-    fn failed(&self, error: io::Error) -> Failure {
-        self.is_closed.set(Output::is_closed(&self.options.output, &error));
-        unwritable(&self.options.output, &error)
     }
 }
 

@@ -20,6 +20,7 @@ use scanhub_schema::{
     Failure, Family, Flags, Header, Kind, MILLIS, Nanos, Pose, Quality, Scan, Status, Topic,
 };
 
+use crate::convert::Ended;
 use crate::convert::writers::is_made_up;
 use crate::mcap::Item;
 use crate::{Encoding, Form, Frame, Recording, VirtualTime};
@@ -57,8 +58,8 @@ pub(super) fn each(
     name: &str,
     encoding: Encoding,
     mode: Option<Mode>,
-    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Failure>,
-) -> Result<(), Failure> {
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Ended>,
+) -> Result<(), Ended> {
     match recording.contents().form {
         Form::Mcap => each_of_mcap(recording, mode, take_item),
         form => {
@@ -94,8 +95,8 @@ pub(super) fn each(
 fn each_of_mcap(
     recording: &Recording,
     mode: Option<Mode>,
-    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Failure>,
-) -> Result<(), Failure> {
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Ended>,
+) -> Result<(), Ended> {
     let (mut reader, catalog) = recording.reader()?;
     let mut sensors = BTreeMap::new();
     for name in &recording.contents().sensors {
@@ -199,8 +200,8 @@ impl Revolutions {
         &mut self,
         header: &Header,
         packets: &[u8],
-        mut take_item: impl FnMut(Header, &Scan) -> Result<(), Failure>,
-    ) -> Result<(), Failure> {
+        mut take_item: impl FnMut(Header, &Scan) -> Result<(), Ended>,
+    ) -> Result<(), Ended> {
         let Revolutions { family, settings, session, scan } = self;
         // Another run of the hub has another clock.
         if session.as_ref().is_none_or(|(boot, _)| *boot != header.boot) {

@@ -13,30 +13,31 @@ use scanhub_schema::file::{METADATA, Writer};
 use scanhub_schema::{Failure, Flags, Header, Kind, Marks, Topic};
 
 use super::scans::{self, DecodedItem, SyntheticClock, stream_heads};
-use super::{Conversion, Packing, Written, form_name};
+use super::{Conversion, Ended, Packing, Written, form_name};
 use crate::mcap::{Catalog, Item, Record, Sample};
 use crate::{Encoding, Form, Frame, Recording, carmen};
 
 /// Writes a stream of telegrams.
-pub(super) fn write_stream(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Failure> {
+pub(super) fn write_stream(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Ended> {
     let recording = conversion.recording;
     let mut heads = stream_heads(recording)?.into_iter().peekable();
     for (number, frame) in frames(recording, conversion.encoding)?.enumerate() {
         let head = heads.next_if(|(before, _)| *before == number).map(|(_, head)| head).unwrap_or_default();
-        let written = out.write_all(&head).and_then(|()| out.write_all(&frame.telegram));
-        written.map_err(|error| conversion.failed(error))?;
+        out.write_all(&head)?;
+        out.write_all(&frame.telegram)?;
         let form = recording.contents().form;
         conversion.count(Written::of_frame(form, number, &frame), frame.wall_ns)?;
     }
-    out.finish().map_err(|error| conversion.failed(error))
+    out.finish()?;
+    Ok(())
 }
 
 /// Writes a CARMEN log.
-pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Failure> {
+pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Ended> {
     let (recording, encoding) = (conversion.recording, conversion.encoding);
     let mut clock = SyntheticClock::of(recording);
     let first_line = carmen::encoding_line(encoding);
-    out.write_all(first_line.as_bytes()).map_err(|error| conversion.failed(error))?;
+    out.write_all(first_line.as_bytes())?;
     let mut first_ns = None;
     for (number, frame) in recording.telegrams(encoding)?.enumerate() {
         let at_ns = clock.wall_ns(&frame);
@@ -45,33 +46,33 @@ pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write
             continue;
         }
         let line = carmen::scan_line(&frame.telegram, encoding.mode, at_ns, *first_ns.get_or_insert(at_ns));
-        let written = out.write_all(line.as_deref().unwrap_or_default().as_bytes());
-        written.map_err(|error| conversion.failed(error))?;
+        out.write_all(line.as_deref().unwrap_or_default().as_bytes())?;
         conversion.count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
     }
-    out.finish().map_err(|error| conversion.failed(error))
+    out.finish()?;
+    Ok(())
 }
 
 /// Writes telegrams that have no header into an MCAP file.
-pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Failure> {
+pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Ended> {
     let (recording, sensor) = (conversion.recording, conversion.sensor);
     conversion.converted.sensors = vec![sensor.to_owned()];
     let form = recording.contents().form;
     let facts = [("converted from".to_owned(), form_name(form).to_owned())];
-    let writer = Writer::packed(file, "", conversion.options.compression.unwrap_or_default(), facts.into());
-    let mut writer = writer.map_err(|error| conversion.failed(error))?;
+    let compression = conversion.options.compression.unwrap_or_default();
+    let mut writer = Writer::packed(file, "", compression, facts.into())?;
     let mut clock = SyntheticClock::of(recording);
     let mut bytes = 0;
     let mut frames = frames(recording, conversion.encoding)?.enumerate().peekable();
     while let Some((number, frame)) = frames.next() {
         let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
         let header = clock.header(&frame, number as u64, next_ns);
-        let written = writer.sample(sensor, Topic::Telegram, &header, &frame.telegram);
-        let written = written.and_then(|()| close_chunk(&mut writer, &mut bytes, frame.telegram.len()));
-        written.map_err(|error| conversion.failed(error))?;
+        writer.sample(sensor, Topic::Telegram, &header, &frame.telegram)?;
+        close_chunk(&mut writer, &mut bytes, frame.telegram.len())?;
         conversion.count(Written::of_frame(form, number, &frame), Some(header.wall_ns))?;
     }
-    writer.finish().map(drop).map_err(|error| conversion.failed(error))
+    writer.finish()?;
+    Ok(())
 }
 
 /// Adds `len` to the `bytes` in the open chunk of `writer`, and ends the chunk if it is large enough.
@@ -104,22 +105,19 @@ pub(super) fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
 }
 
 /// Copies an MCAP file: every message that can be read, of all channels including those of other programs, and a new index.
-pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Failure> {
+pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Ended> {
     let recording = conversion.recording;
     let (mut reader, catalog) = recording.reader()?;
     let sensor = recording.chosen();
     let compression = conversion.options.compression.unwrap_or_default();
-    let writer = Writer::packed(file, &catalog.profile, compression, catalog.facts.clone());
-    let writer = writer.map_err(|error| conversion.failed(error))?;
+    let writer = Writer::packed(file, &catalog.profile, compression, catalog.facts.clone())?;
     let mut copy = Copy { writer, catalog, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {
             Item::Telegram(sample) if sensor.is_none_or(|sensor| *sensor == sample.sensor) => {
                 let Sample { sensor, header, telegram } = &sample;
-                let written = copy.writer.sample(sensor, Topic::Telegram, header, telegram);
-                let written =
-                    written.and_then(|()| close_chunk(&mut copy.writer, &mut copy.bytes, telegram.len()));
-                written.map_err(|error| conversion.failed(error))?;
+                copy.writer.sample(sensor, Topic::Telegram, header, telegram)?;
+                close_chunk(&mut copy.writer, &mut copy.bytes, telegram.len())?;
                 let is_scan = crate::is_scan(header.family, telegram);
                 conversion.count(Written::of(is_scan), Some(header.wall_ns))?;
             }
@@ -130,12 +128,13 @@ pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result
                 let is_chosen =
                     sensor.is_none_or(|sensor| channel.is_some_and(|channel| channel.sensor == *sensor));
                 if is_chosen || record.opcode != op::MESSAGE {
-                    copy.record(&record).map_err(|error| conversion.failed(error))?;
+                    copy.record(&record)?;
                 }
             }
         }
     }
-    copy.writer.finish().map(drop).map_err(|error| conversion.failed(error))
+    copy.writer.finish()?;
+    Ok(())
 }
 
 struct Copy<'a, W: Write> {
@@ -207,13 +206,12 @@ pub(super) trait ScanSink {
 }
 
 /// Writes the scans into `sink`.
-pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) -> Result<(), Failure> {
+pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) -> Result<(), Ended> {
     let recording = conversion.recording;
     let (sensor, encoding, mode) = (conversion.sensor, conversion.encoding, conversion.options.mode);
     let mut is_empty = true;
     scans::each(recording, sensor, encoding, mode, &mut |item| {
-        let written = sink.write(&item).map_err(|error| conversion.failed(error))?;
-        let Some(written) = written else { return Ok(()) };
+        let Some(written) = sink.write(&item)? else { return Ok(()) };
         let DecodedItem::Scan(_, header, _) = item else { return conversion.count(written, None) };
         is_empty = false;
         conversion.count(written, Some(header.wall_ns))
@@ -221,14 +219,15 @@ pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) 
     if is_empty {
         let message = format!("there is no scan in {}", recording.path().display());
         let hint = "scans are decoded from topic telegram, or taken from topic scan";
-        return Err(Failure::new(Kind::Input, message, hint));
+        return Err(Failure::new(Kind::Input, message, hint).into());
     }
     if sink.lacks_intensities() {
         let message = format!("no scan in {} has intensities", recording.path().display());
         let hint = "leave --intensities out; an LMS sends reflector levels only in some measuring modes, such as 0x01";
-        return Err(Failure::new(Kind::Input, message, hint));
+        return Err(Failure::new(Kind::Input, message, hint).into());
     }
-    sink.finish().map_err(|error| conversion.failed(error))
+    sink.finish()?;
+    Ok(())
 }
 
 /// An MCAP file with only messages of ROS 2.
@@ -333,10 +332,10 @@ pub(super) fn write_marks(
     conversion: &mut Conversion,
     columns: MarkColumns,
     mut out: Packing<impl Write>,
-) -> Result<(), Failure> {
+) -> Result<(), Ended> {
     let recording = conversion.recording;
     let mut lines = Vec::new();
-    columns.names(&mut lines).map_err(|error| conversion.failed(error))?;
+    columns.names(&mut lines)?;
     let (mut samples, mut written) = (0, 0);
     if recording.contents().form == Form::Mcap {
         let (mut reader, catalog) = recording.reader()?;
@@ -350,8 +349,8 @@ pub(super) fn write_marks(
             {
                 continue;
             }
-            let rows = columns.rows(&mut lines, &header, &marks).and_then(|()| out.write_all(&lines));
-            rows.map_err(|error| conversion.failed(error))?;
+            columns.rows(&mut lines, &header, &marks)?;
+            out.write_all(&lines)?;
             lines.clear();
             samples += 1;
             written += marks.marks().len() as u64;
@@ -364,10 +363,11 @@ pub(super) fn write_marks(
         let hint = format!(
             "`scanhub replay {path}` finds marks in the scans, and meanwhile `scanhub record SENSOR/marks` records them"
         );
-        return Err(Failure::new(Kind::NoTopic, message, hint));
+        return Err(Failure::new(Kind::NoTopic, message, hint).into());
     }
     conversion.converted.marks = Some(written);
-    out.finish().map_err(|error| conversion.failed(error))
+    out.finish()?;
+    Ok(())
 }
 
 /// Bytes of telegrams after which a chunk ends.
