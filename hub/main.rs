@@ -3,7 +3,7 @@
 
 mod cli;
 mod demo;
-mod encoders;
+mod mounts;
 mod own_domain;
 mod replay;
 
@@ -30,7 +30,7 @@ use tracing::level_filters::LevelFilter;
 
 use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
-use encoders::Encoders;
+use mounts::SimulatedMounts;
 
 /// In the environment of a process that shall not outlive the one that started it.
 const END_WITH_PARENT: &str = "SCANHUB_END_WITH_PARENT";
@@ -248,8 +248,8 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
             say(&format!("ready {}", ports.join(" ")));
         }
     };
-    let encoders = Encoders::start(&simulate.angles, &options, &everywhere.publisher_domain()?)?;
-    let report = |number, report| encoders.report(number, report);
+    let mounts = SimulatedMounts::start(&simulate.angles, &options, &everywhere.publisher_domain()?)?;
+    let report = |number, report| mounts.report(number, report);
     scanhub_sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, report).map(drop)
 }
 

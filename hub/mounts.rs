@@ -1,29 +1,26 @@
-//! Publishes the angles of simulated mounts as topics, as the program of an encoder does for a real mount.
+//! Publishes the angles of simulated and recorded mounts as topics, as the program of an encoder does for a real mount.
 
-use std::sync::mpsc::{self, Receiver, Sender};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Sender};
 use std::thread::{self, JoinHandle};
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher, Wake};
+use scanhub_daemon::Player;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Flags, Header, Kind, Maker, Tilt};
 use scanhub_shm::Domain;
 use scanhub_sim::mount::Report;
 use scanhub_sim::options::SimulateOptions;
 
-/// Publishing end of all mounts. Dropping it removes the topics.
-pub(crate) struct Encoders {
-    /// `None` once no more reports follow.
-    reports: Option<Sender<NumberedReport>>,
-    /// Owns the topics, because publishers stay in one thread.
+/// Publishing end of all simulated mounts. Dropping it removes the topics.
+pub(crate) struct SimulatedMounts {
+    /// Reports of the encoder at the port with a number; `None` once no more follow.
+    reports: Option<Sender<(usize, Report)>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The topic of a mount, and its subscribers' wake-up.
-type MountTopic = (Publication<Tilt>, SensorPublisher);
-/// A report of the encoder at the port with this number.
-type NumberedReport = (usize, Report);
-
-impl Encoders {
+impl SimulatedMounts {
     /// Publishes the mount at port `i` as `names[i]` in `domain`.
     ///
     /// # Errors
@@ -33,7 +30,7 @@ impl Encoders {
         names: &[String],
         options: &SimulateOptions,
         domain: &Domain,
-    ) -> Result<Encoders, Failure> {
+    ) -> Result<SimulatedMounts, Failure> {
         for (number, name) in names.iter().enumerate() {
             let has_mount = options.world.mount(number % options.world.sensors()).is_some();
             if number >= options.ports.len() || !has_mount {
@@ -42,23 +39,17 @@ impl Encoders {
                 return Err(Failure::new(Kind::Usage, what, "--world tilt has one, see docs/worlds.md"));
             }
         }
-        let (reports, receiver) = mpsc::channel();
-        let (on_start, start) = mpsc::channel();
+        let (reports, receiver) = mpsc::channel::<(usize, Report)>();
         let (names, domain) = (names.to_vec(), domain.clone());
-        let thread = thread::spawn(move || match open(&names, &domain) {
-            Ok(topics) => {
-                let _ = on_start.send(Ok(()));
-                publish(&receiver, topics);
+        let open = move || names.iter().map(|name| MountTopic::open(name, &domain)).collect();
+        let thread = start_thread(open, move |mut topics: Vec<MountTopic>| {
+            for (number, report) in receiver {
+                let Some(topic) = topics.get_mut(number) else { continue };
+                let tilt = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
+                topic.publish(report.stamp_ns, tilt, |header| Header { flags: Flags::SIMULATED, ..header });
             }
-            Err(failure) => {
-                let _ = on_start.send(Err(failure));
-            }
-        });
-        let encoders = Encoders { reports: Some(reports), thread: Some(thread) };
-        match start.recv() {
-            Ok(outcome) => outcome.map(|()| encoders),
-            Err(_) => Err(Failure::new(Kind::Failed, "the thread that publishes angles has ended", "")),
-        }
+        })?;
+        Ok(SimulatedMounts { reports: Some(reports), thread: Some(thread) })
     }
 
     /// Publishes `report` of the encoder at port `number`, if it has a name.
@@ -69,31 +60,94 @@ impl Encoders {
     }
 }
 
-impl Drop for Encoders {
+impl Drop for SimulatedMounts {
     fn drop(&mut self) {
         self.reports = None;
-        if let Some(thread) = self.thread.take() {
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+/// Threads that publish the angles of recorded mounts while the hub plays the recording. Dropping it ends them.
+pub(crate) struct RecordedMounts {
+    stop: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl RecordedMounts {
+    /// Publishes the mounts of `player` in `domain`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`PublishSession::beside`].
+    pub(crate) fn start(player: &Arc<Player>, domain: &Domain) -> Result<RecordedMounts, Failure> {
+        let mut mounts = RecordedMounts { stop: Arc::default(), threads: Vec::new() };
+        for mount in player.mounts() {
+            let (player, stop) = (player.clone(), mounts.stop.clone());
+            let (name, mount, domain) = (mount.name().to_owned(), mount.clone(), domain.clone());
+            let open = move || MountTopic::open(&name, &domain);
+            mounts.threads.push(start_thread(open, move |mut topic| {
+                mount.play(&player, &stop, |angle| {
+                    let flags = Flags::REPLAYED | angle.header.flags & Flags::SIMULATED;
+                    let wall_ns = angle.header.wall_ns;
+                    topic.publish(angle.stamp_ns, angle.tilt, |header| Header { flags, wall_ns, ..header });
+                });
+            })?);
+        }
+        Ok(mounts)
+    }
+}
+
+impl Drop for RecordedMounts {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
             let _ = thread.join();
         }
     }
 }
 
-fn open(names: &[String], domain: &Domain) -> Result<Vec<MountTopic>, Failure> {
-    let open = |name: &String| {
-        let sensor = PublishSession::beside(domain, name, Maker::Mount.topics(), TopicLimits::default())?;
-        Ok((sensor.topic()?, sensor))
-    };
-    names.iter().map(open).collect()
+/// The topic of a mount, and its subscribers' wake-up.
+struct MountTopic {
+    topic: Publication<Tilt>,
+    sensor: SensorPublisher,
 }
 
-/// Publishes all reports until their sender is dropped.
-fn publish(reports: &Receiver<NumberedReport>, mut topics: Vec<MountTopic>) {
-    for (number, report) in reports {
-        let Some((topic, sensor)) = topics.get_mut(number) else { continue };
-        let header = Header { flags: Flags::SIMULATED, ..topic.header_at(report.stamp_ns) };
-        let tilt = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
+impl MountTopic {
+    fn open(name: &str, domain: &Domain) -> Result<MountTopic, Failure> {
+        let sensor = PublishSession::beside(domain, name, Maker::Mount.topics(), TopicLimits::default())?;
+        Ok(MountTopic { topic: sensor.topic()?, sensor })
+    }
+
+    /// Publishes `tilt` as of `stamp_ns`, with the header that `change` returns.
+    fn publish(&mut self, stamp_ns: u64, tilt: Tilt, change: impl FnOnce(Header) -> Header) {
+        let header = change(self.topic.header_at(stamp_ns));
         // Without memory, the sample's number is skipped. A subscriber that is not woken polls ten times a second.
-        let _ = topic.send_with(&header, |sample| *sample = tilt);
-        let _ = sensor.wake(Wake::Telegram);
+        let _ = self.topic.send_with(&header, |sample| *sample = tilt);
+        let _ = self.sensor.wake(Wake::Telegram);
+    }
+}
+
+/// Starts a thread that calls `open` and then `publish` with its result. Publishers stay in the thread that opens them.
+///
+/// # Errors
+///
+/// Returns the errors of `open`.
+fn start_thread<T>(
+    open: impl FnOnce() -> Result<T, Failure> + Send + 'static,
+    publish: impl FnOnce(T) + Send + 'static,
+) -> Result<JoinHandle<()>, Failure> {
+    let (on_start, start) = mpsc::channel();
+    let thread = thread::spawn(move || match open() {
+        Ok(topics) => {
+            let _ = on_start.send(Ok(()));
+            publish(topics);
+        }
+        Err(failure) => {
+            let _ = on_start.send(Err(failure));
+        }
+    });
+    match start.recv() {
+        Ok(outcome) => outcome.map(|()| thread),
+        Err(_) => Err(Failure::new(Kind::Failed, "the thread that publishes angles has ended", "")),
     }
 }

@@ -2,7 +2,6 @@
 //! player.
 
 pub(crate) mod line;
-mod mounts;
 pub(crate) mod page;
 
 use std::io::{IsTerminal, Read, stderr, stdin};
@@ -21,8 +20,9 @@ use scanhub_schema::Failure;
 use serde::Serialize;
 
 use crate::cli::{Everywhere, Replay};
+
+use crate::mounts::RecordedMounts;
 use line::Line;
-use mounts::Mounts;
 
 /// Runs until the recording has been played or the user ends it. Then prints a summary.
 pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Failure> {
@@ -38,7 +38,7 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
     let mut console = None;
     let mut mounts = None;
     let played = scanhub_daemon::replay(&options, &domain, |ready, player| {
-        let started = mounts.insert(Mounts::start(player, &domain));
+        let started = mounts.insert(RecordedMounts::start(player, &domain));
         if started.is_err() {
             return player.end();
         }

@@ -4,7 +4,7 @@
 use std::fs::OpenOptions;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child as Process, ChildStdout, Command, Stdio};
 use std::sync::mpsc::{self, Sender};
 use std::thread;
@@ -12,7 +12,6 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use scanhub_schema::{Failure, Family, Kind};
-use scanhub_shm::Domain;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -54,10 +53,35 @@ impl Stage {
         self.directory.path().join("log")
     }
 
-    /// Returns the standard error of a process.
-    fn errors(&self) -> Stdio {
+    /// Starts this program with `arguments` in the domain. With a `listener`, the lines of the child are sent there with
+    /// its number.
+    fn start(&self, arguments: &[String], listener: Option<(usize, Sender<Line>)>) -> Result<Child, Failure> {
+        let failed = |error: io::Error| {
+            Failure::new(Kind::Failed, format!("cannot start scanhub {}: {error}", arguments.join(" ")), "")
+        };
         let log = OpenOptions::new().append(true).create(true).open(self.log());
-        log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from)
+        let errors = log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from);
+        let (root, program) = (self.domain.root(), std::env::current_exe().map_err(failed)?);
+        let mut process = Command::new(program)
+            .args(arguments)
+            .args(["--domain", self.domain.name(), "--root"])
+            .arg(root.parent().unwrap_or(root))
+            .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
+            .env(crate::END_WITH_PARENT, "1")
+            .env("STATE_DIRECTORY", self.directory.path())
+            // Ctrl-C must reach only the demonstration, which ends its children in the right order.
+            .process_group(0)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(errors)
+            .spawn()
+            .map_err(failed)?;
+        if let Some((of, lines)) = listener
+            && let Some(stdout) = process.stdout.take()
+        {
+            forward(BufReader::new(stdout), of, lines);
+        }
+        Ok(Child { process })
     }
 
     /// Returns the families of the sensors. Each family has one simulator.
@@ -83,28 +107,15 @@ impl Stage {
         });
         let settings = self.world.settings().iter().map(|setting| format!("--set={setting}"));
         let links: Vec<String> = links.chain(settings).collect();
-        let hub = Child::start(
-            &[&["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()], &links[..]]
-                .concat(),
-            &self.domain,
-            self.directory.path(),
-            None,
-            self.errors(),
-        )?;
-        Ok(hub.await_ready(HUB, lines)?.0)
+        let run = ["run", "--json", "--no-system-config", FORGETS].map(str::to_owned);
+        Ok(self.start(&[&run, &links[..]].concat(), None)?.await_ready(HUB, lines)?.0)
     }
 
     pub(super) fn start_consumers(&self, lines: &Sender<Line>) -> Result<Vec<Child>, Failure> {
         let start = |(of, Sensor { name: sensor, .. }): (usize, &Sensor)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(
-                &arguments,
-                &self.domain,
-                self.directory.path(),
-                Some((of, lines.clone())),
-                self.errors(),
-            )
+            self.start(&arguments, Some((of, lines.clone())))
         };
         self.sensors.iter().enumerate().map(start).collect()
     }
@@ -119,8 +130,7 @@ impl Stage {
         })?;
         let site = path.display().to_string();
         let arguments = ["track", "--site", &site, "--as", "people", "--delay", DELAY].map(str::to_owned);
-        let listener = Some((TRACKER, lines.clone()));
-        Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
+        self.start(&arguments, Some((TRACKER, lines.clone()))).map(Some)
     }
 
     pub(super) fn start_simulators(&self, seed: u64, lines: &Sender<Line>) -> Result<Vec<Child>, Failure> {
@@ -138,8 +148,7 @@ impl Stage {
             Vec::new()
         };
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..], &angles[..]].concat();
-        let simulator = Child::start(&arguments, &self.domain, self.directory.path(), None, self.errors())?;
-        Ok(simulator.await_ready(SIMULATOR, lines)?.0)
+        Ok(self.start(&arguments, None)?.await_ready(SIMULATOR, lines)?.0)
     }
 
     /// Starts the verb that sees in three dimensions, if the sensor is on a mount. The angles of the mount must exist.
@@ -147,16 +156,12 @@ impl Stage {
         if self.world != World::Tilt {
             return Ok(None);
         }
-        let arguments: Vec<String> = TILTED_VERB.iter().map(|word| (*word).to_owned()).collect();
-        let listener = Some((TILTED, lines.clone()));
-        Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
+        self.start(&TILTED_VERB.map(str::to_owned), Some((TILTED, lines.clone()))).map(Some)
     }
 
     /// Starts the page for browsers, and returns its address too.
     pub(super) fn start_web(&self) -> Result<(Child, String), Failure> {
-        let arguments = ["web".into(), "--json".into()];
-        let web = Child::start(&arguments, &self.domain, self.directory.path(), None, self.errors())?;
-        // Lines about viewers are not shown.
+        let web = self.start(&["web".into(), "--json".into()], None)?;
         let (web, ready) = web.await_ready(WEB, mpsc::channel().0)?;
         let ready: Value = serde_json::from_str(&ready).unwrap_or_default();
         match ready["url"].as_str() {
@@ -182,41 +187,6 @@ pub(super) struct Child {
 }
 
 impl Child {
-    /// Starts this program with `arguments` in `domain`. `state` is its state directory, and `errors` its standard
-    /// error. With a `listener`, the lines of the child are sent there with its number.
-    pub(super) fn start(
-        arguments: &[String],
-        domain: &Domain,
-        state: &Path,
-        listener: Option<(usize, Sender<Line>)>,
-        errors: Stdio,
-    ) -> Result<Child, Failure> {
-        let failed = |error: std::io::Error| {
-            Failure::new(Kind::Failed, format!("cannot start scanhub {}: {error}", arguments.join(" ")), "")
-        };
-        let program = std::env::current_exe().map_err(failed)?;
-        let mut process = Command::new(program)
-            .args(arguments)
-            .args(["--domain", domain.name(), "--root"])
-            .arg(domain.root().parent().unwrap_or(domain.root()))
-            .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
-            .env(crate::END_WITH_PARENT, "1")
-            .env("STATE_DIRECTORY", state)
-            // Ctrl-C must reach only the demonstration, which ends its children in the right order.
-            .process_group(0)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(errors)
-            .spawn()
-            .map_err(failed)?;
-        if let Some((of, lines)) = listener
-            && let Some(stdout) = process.stdout.take()
-        {
-            forward(BufReader::new(stdout), of, lines);
-        }
-        Ok(Child { process })
-    }
-
     /// Waits for the first line, which says that the child is ready, and returns it. Later lines are sent to `lines`.
     pub(super) fn await_ready(mut self, of: usize, lines: Sender<Line>) -> Result<(Child, String), Failure> {
         let mut first = String::new();

@@ -69,11 +69,11 @@ fn circles_change_in_a_stream_without_a_gap() {
         sequence(&lines, "topic_seq");
         assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{class}");
     }
-    // A line that came too late here does not tell its circles.
+    // A line that arrived too late here has no circles.
     let mut verdicts = zones.of_class("zones");
     verdicts.retain(|line| line["topic_seq"].is_u64() && line["stale"] != true);
     // On a busy machine, scans may be missing for so long that the hub sends unknown zones, at once with the new circles.
-    // They say nothing about the change. All other samples belong to a scan.
+    // The change does not cause them. All other samples belong to a scan.
     let mut last_ns = 0;
     verdicts.retain(|line| {
         let stamp_ns = number(line, "stamp_ns");

@@ -1,4 +1,4 @@
-//! What may stand in which source: unsafe code, shared memory, the sensor's EEPROM, the shape of a file.
+//! Rules for what a source may contain: unsafe code, shared memory, the scanner's EEPROM, and the shape of a file.
 
 use super::tree::{Tree, code, find};
 
