@@ -1,5 +1,5 @@
-//! Golden datagrams of version 2, in `tests/vectors/datagram`: built from values they are these bytes, read they are these
-//! values. Do not change these tests: another form is another version. `docs/datagram.md` explains the bytes.
+//! Golden datagrams of version 2, in `tests/vectors/datagram.json`: the tests build them from values and read the values back.
+//! Do not change these tests: another form needs another version. `docs/datagram.md` explains the bytes.
 
 #[path = "datagram/says.rs"]
 mod says;
@@ -10,11 +10,7 @@ mod vectors;
 
 use scanhub_schema::Family;
 use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, LanFlags, MTU_LEAST, MTU_SAFE};
-use vectors::{Vector, bytes, vectors};
-
-fn vector(name: &str) -> Vec<u8> {
-    bytes(&format!("{name}.hex"))
-}
+use vectors::{Vector, bytes as vector, vectors};
 
 /// Changes a datagram and makes its checksum right again.
 fn with(datagram: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
@@ -114,22 +110,22 @@ fn refusals_are_these_bytes() {
 /// Which datagrams a receiver refuses although their bytes are right is tested in `clients/network/tests/golden.rs`.
 #[test]
 fn these_bytes_are_values_or_refused() {
-    for Vector { file, bytes, says } in vectors() {
+    for Vector { name, bytes, says } in vectors() {
         let checked = Datagram::read(&bytes).and_then(|datagram| {
             datagram.check_payload()?;
             Ok(datagram)
         });
         match (says["refusal"].as_str(), checked) {
             (None, Ok(datagram)) => {
-                assert_eq!(says::head(&datagram), says["head"], "{file}");
-                assert_eq!(says::payload(&datagram), says["payload"], "{file}");
+                assert_eq!(says::head(&datagram), says["head"], "{name}");
+                assert_eq!(says::payload(&datagram), says["payload"], "{name}");
             }
-            (None, Err(refused)) => panic!("{file}: {refused:?}"),
-            (Some(refusal), Err(refused)) => assert_eq!(refused.name(), refusal, "{file}"),
+            (None, Err(refused)) => panic!("{name}: {refused:?}"),
+            (Some(refusal), Err(refused)) => assert_eq!(refused.name(), refusal, "{name}"),
             (Some(refusal), Ok(_)) => {
                 let by_receivers =
                     ["unauthenticated", "mac", "epoch", "untimely", "twin", "stale", "capacity"];
-                assert!(by_receivers.contains(&refusal), "{file} is accepted");
+                assert!(by_receivers.contains(&refusal), "{name} is accepted");
             }
         }
     }
@@ -165,12 +161,13 @@ fn the_page_shows_these_bytes() {
     assert_eq!(end, HEAD);
     let families = Family::ALL.map(|family| format!("{} {}", family as u8, family.name())).join(", ");
     assert!(section("Header").contains(&families), "{families}");
-    let is_file = |row: &&Vec<&str>| row[0].ends_with(".hex`");
+    let is_datagram = |row: &&Vec<&str>| row[0].starts_with('`');
     let sizes = rows("Payloads");
-    let sizes = sizes.iter().filter(is_file).map(|row| (row[0].trim_matches('`'), row[1].parse().unwrap()));
+    let sizes =
+        sizes.iter().filter(is_datagram).map(|row| (row[0].trim_matches('`'), row[1].parse().unwrap()));
     let vectors = vectors();
     let sound = vectors.iter().filter(|vector| vector.says["refusal"].is_null());
-    assert!(sizes.eq(sound.map(|vector| (vector.file.as_str(), vector.bytes.len()))));
+    assert!(sizes.eq(sound.map(|vector| (vector.name.as_str(), vector.bytes.len()))));
     let example =
         vector("zones").chunks(16).enumerate().fold(String::from("text\n"), |lines, (number, bytes)| {
             let digits: String = bytes.iter().map(|byte| format!("{byte:02x}")).collect();

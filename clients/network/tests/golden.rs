@@ -1,4 +1,4 @@
-//! Golden datagrams of version 2, in `tests/vectors/datagram`, as a receiver without a key accepts or refuses them.
+//! Golden datagrams of version 2, in `tests/vectors/datagram.json`, as a receiver without a key accepts or refuses them.
 //! `schema/tests/datagram.rs` tests their bytes.
 
 #[path = "../../../tests/it/lan/vectors.rs"]
@@ -11,9 +11,9 @@ use vectors::{Vector, bytes, vectors};
 
 #[test]
 fn receiver_accepts_or_refuses_them() {
-    let zones = bytes("zones.hex");
+    let zones = bytes("zones");
     let zones = Datagram::read(&zones).unwrap();
-    for Vector { file, bytes: datagram, says } in vectors() {
+    for Vector { name, bytes: datagram, says } in vectors() {
         if says["with_key"] == true {
             continue;
         }
@@ -31,13 +31,13 @@ fn receiver_accepts_or_refuses_them() {
         let from = if says["from_another"] == true { 2 } else { 1 };
         let result = stats.receive(&datagram, from, 1_000_000_000).map(|(_, fresh)| fresh);
         let Some(refusal) = says["refusal"].as_str() else {
-            assert_eq!(result, Ok(Fresh::New), "{file}");
+            assert_eq!(result, Ok(Fresh::New), "{name}");
             continue;
         };
         let refused = result.unwrap_err();
-        assert_eq!(refused.name(), refusal, "{file}");
+        assert_eq!(refused.name(), refusal, "{name}");
         for reason in DatagramError::ALL {
-            assert_eq!(stats.refused(reason), u64::from(reason == refused), "{file}, {}", reason.name());
+            assert_eq!(stats.refused(reason), u64::from(reason == refused), "{name}, {}", reason.name());
         }
     }
 }

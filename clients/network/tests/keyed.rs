@@ -1,5 +1,5 @@
-//! Golden datagrams with a MAC, in `tests/vectors/keyed.json`: built from values they are these bytes, and the receiving end
-//! makes of them what the list says, as the readers in other languages do. Do not change the bytes: others have them.
+//! Golden datagrams with a MAC, in `tests/vectors/keyed.json`. The tests build them from values, and check that the receiver
+//! handles them as the list says, like the readers in other languages. Do not change the bytes: other programs have them.
 
 #[path = "../../../tests/it/lan/keyed_vectors.rs"]
 mod keyed_vectors;
@@ -11,6 +11,7 @@ use scanhub_schema::datagram::{
     Announce, Announced, Datagram, DatagramError, HEAD, Head, PORT, Packed, group,
 };
 use scanhub_schema::{Family, Topic, Zones};
+use serde_json::Value;
 
 const SECOND_NS: u64 = 1_000_000_000;
 /// When the announcement comes with which it begins.
@@ -181,9 +182,11 @@ fn list() -> String {
 
 /// The payload of the golden scan.
 fn scan() -> Vec<u8> {
-    let golden = include_str!("../../../tests/vectors/datagram/scan.hex");
-    let digits: String = golden.split_whitespace().collect();
-    unhex(&digits).split_off(HEAD)
+    let list: Value =
+        serde_json::from_str(include_str!("../../../tests/vectors/datagram.json")).expect("JSON");
+    let vectors = list["vectors"].as_array().expect("a list");
+    let scan = vectors.iter().find(|vector| vector["name"] == "scan").expect("a scan");
+    unhex(scan["bytes"].as_str().expect("bytes")).split_off(HEAD)
 }
 
 #[test]

@@ -10,10 +10,11 @@ import numpy as np
 from scanhub import layout, model, people, processed, scan, status, tilted
 
 GOLDEN = Path(sys.argv[1])
+BYTES = dict(line.split() for line in (GOLDEN / "bytes.txt").read_text().splitlines())
 
 
 def golden(name: str) -> bytes:
-    return bytes.fromhex((GOLDEN / f"{name}.hex").read_text())
+    return bytes.fromhex(BYTES[name])
 
 
 class Chunk:

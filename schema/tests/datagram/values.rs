@@ -1,14 +1,12 @@
-//! What the golden datagrams say, as values.
-
-#[path = "values/tilted.rs"]
-mod tilted;
+//! Values of the golden datagrams.
 
 use bytemuck::Zeroable;
 use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use scanhub_schema::{
-    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Event, EventKind,
-    Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
-    Segment, State, Status, Tilt, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
+    Background, BackgroundHead, COUNTERS, Cloud, CloudHead, CloudPoint, Code, Contents, Corner, Counter,
+    Counters, Early, Event, EventKind, Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion,
+    MotionMethod, Obstacle, Obstacles, PointClass, Pose, Scan, ScanHead, Segment, State, Status, Tilt, Topic,
+    Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
@@ -58,8 +56,8 @@ pub(crate) const ALL: [Golden; 22] = [
     ("tilt_no_rate", Head { sequence: 2, ..head(Some(Topic::Tilt)) }, |room| {
         Tilt { angle_rad: 0.125, ..Tilt::default() }.pack(room)
     }),
-    ("cloud", head(Some(Topic::Cloud)), |room| tilted::cloud().pack(room)),
-    ("obstacles", head(Some(Topic::Obstacles)), |room| tilted::obstacles().pack(room)),
+    ("cloud", head(Some(Topic::Cloud)), |room| cloud().pack(room)),
+    ("obstacles", head(Some(Topic::Obstacles)), |room| obstacles().pack(room)),
 ];
 
 fn tracks() -> Tracks {
@@ -373,4 +371,44 @@ fn status() -> Status {
     status.set_port("/dev/ttyUSB0");
     status.set_last_error("größer");
     status
+}
+
+fn cloud() -> Box<Cloud> {
+    let point = |at, beam, class| CloudPoint { at, beam, point_class: class as u8, reserved: 0 };
+    let flags = Cloud::FIRST | Cloud::COMPLETE;
+    let points = [
+        point([1.5, -2.25, 0.125], 0, PointClass::Background),
+        point([1.25, 0.0, 0.5], 180, PointClass::Foreground),
+        point([-0.5, 3.75, -0.0625], 360, PointClass::Unknown),
+    ];
+    Cloud::of(CloudHead { sweep: 12, generation: 3, flags, ..CloudHead::default() }, &points)
+}
+
+fn obstacles() -> Obstacles {
+    let mut found = Obstacles {
+        sweep: 12,
+        generation: 3,
+        left_out: 1,
+        flags: Obstacles::COMPLETE,
+        ..Obstacles::default()
+    };
+    found.push(Obstacle {
+        middle: [1.25, 0.0, 0.5],
+        low: [1.125, -0.125, 0.0],
+        high: [1.375, 0.125, 1.0],
+        distance_m: 1.125,
+        points: 120,
+        flags: Obstacle::FOREGROUND | Obstacle::NEAR,
+        ..Obstacle::default()
+    });
+    found.push(Obstacle {
+        middle: [4.0, -1.5, 0.75],
+        low: [3.875, -1.75, 0.0],
+        high: [4.25, -1.25, 1.75],
+        distance_m: 4.1875,
+        points: 64,
+        flags: Obstacle::FOREGROUND,
+        ..Obstacle::default()
+    });
+    found
 }

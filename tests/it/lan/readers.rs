@@ -53,7 +53,7 @@ pub(crate) fn golden(reader: &mut Reader) {
         let by_itself =
             !["after", "after_hubs", "from_another", "with_key"].iter().any(|key| says.contains_key(*key));
         let expected = if by_itself { vector.says.clone() } else { damaged::expected(&vector.bytes) };
-        same(&vector.file, &vector.bytes, reader.read(None, &vector.bytes), &expected);
+        same(&vector.name, &vector.bytes, reader.read(None, &vector.bytes), &expected);
     }
 }
 

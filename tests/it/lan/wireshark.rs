@@ -115,8 +115,8 @@ fn golden_datagrams_are_shown_field_by_field() {
                 wanted.insert("scanhub.crc_status".to_owned(), vec!["good".to_owned()]);
             }
             // A part is shown as one; what it is a part of is not.
-            Some("payload") if vector.file.starts_with("scan_part_") => {
-                let part = vector.file.trim_start_matches("scan_part_").trim_end_matches(".hex");
+            Some("payload") if vector.name.starts_with("scan_part_") => {
+                let part = vector.name.trim_start_matches("scan_part_");
                 for (field, value) in [("part", part), ("parts", "3"), ("crc_status", "good")] {
                     wanted.insert(format!("scanhub.{field}"), vec![value.to_owned()]);
                 }
@@ -140,7 +140,7 @@ fn golden_datagrams_are_shown_field_by_field() {
                 as_shown(name, &shown[name]),
                 as_shown(name, &values.join(",")),
                 "{name} of {}",
-                vector.file
+                vector.name
             );
         }
     }
