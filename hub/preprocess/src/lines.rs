@@ -1,13 +1,12 @@
-//! Finds the straight lines of one scan: each beam ends on the line that it meets, or on nothing, and the lines are those
-//! that make the measured ranges likeliest, if each range has normal noise along its beam. Nothing is kept from one scan
-//! to the next. Refuses to know what a line belongs to.
+//! Finds the straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise along
+//! its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
 //! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined to
 //! lines, the likeliest first, then the cuts between lines are moved (`pieces`).
 //!
-//! Nothing is set by hand: the noise comes from the scan itself, and a line has to explain more than its numbers
-//! explain of mere noise, by a Bayesian information criterion.
+//! No parameter is set by hand: the noise is estimated from the scan, and a Bayesian information criterion decides whether a
+//! line explains more than noise.
 
 mod fit;
 mod pieces;
@@ -21,28 +20,28 @@ use crate::directions::Directions;
 use fit::{Information, Ray};
 use pieces::{Bounds, Cutter, Piece};
 
-/// Which lines are looked for.
+/// Settings of a line finder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// So many lines at most, 1 to 64.
+    /// Maximum number of lines, 1 to 64.
     pub max: u8,
-    /// Beams of a line, at least; 3 and more.
+    /// Minimum number of beams of a line, at least 3.
     pub min_points: u16,
-    /// The slower, better form: cuts are taken to wherever they help most, and beams at a line's ends that fit worst are
-    /// left out.
+    /// Whether to use the slower, better form: cuts are moved to where they help most, and beams at the ends of a line that fit
+    /// worst are dropped.
     pub polish: bool,
-    /// What ends the joining of lines.
+    /// Condition that ends the joining of lines.
     pub stop: Stop,
 }
 
-/// What ends the joining of lines.
+/// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Stop {
-    /// One line less would explain the scan worse than its noise does. Points more than a metre apart are never joined: the
-    /// distance that the paper has for real scans.
+    /// One line less would explain the scan worse than its noise does. Points more than one meter apart are never joined. The
+    /// paper has this distance for real scans.
     Likelihood,
-    /// There are no more than `max`. Points farther apart than this many metres are never joined. For comparisons at equal
-    /// numbers.
+    /// At most `max` lines are left. Points farther apart than this number of meters are never joined. Used for comparisons at
+    /// equal numbers of lines.
     Number(f64),
 }
 
@@ -57,18 +56,18 @@ pub struct LineFinder {
     pose: Pose,
     settings: Settings,
     directions: Directions,
-    /// The beams that have a range, and their numbers.
+    /// Beams that have a range, and their numbers.
     rays: Box<[Ray]>,
     beams: Box<[u16]>,
-    /// Behind the last ray of each group, the neighbours of which are near enough.
+    /// Index after the last ray of each group. Neighbors in a group are near enough to each other.
     ends: Box<[u16]>,
-    /// Room to find the noise in.
+    /// Memory for estimating the noise.
     steps: Box<[[f64; 2]]>,
     cutter: Cutter,
 }
 
 impl LineFinder {
-    /// For a sensor that sits at `pose` and has at most `beams` beams.
+    /// Creates a finder for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, settings: Settings, beams: usize) -> LineFinder {
         let beams = beams.min(BEAMS);
         LineFinder {
@@ -83,7 +82,7 @@ impl LineFinder {
         }
     }
 
-    /// Goes on for a sensor at `pose` as `settings` say.
+    /// Continues with these `settings` for a sensor at `pose`.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         (self.pose, self.settings) = (pose, settings);
     }
@@ -115,7 +114,7 @@ impl LineFinder {
         corners(out, &self.pose, scan.step.abs() as f32);
     }
 
-    /// Takes over the beams of `scan` that have a range; how many these are.
+    /// Stores the beams of `scan` that have a range, and returns their number.
     fn read(&mut self, scan: &Scan) -> usize {
         self.directions.fit(&self.pose, scan);
         let mut count = 0;
@@ -127,7 +126,7 @@ impl LineFinder {
         count
     }
 
-    /// Where points are too far apart for one line; how many groups there are.
+    /// Groups the rays where points are too far apart for one line, and returns the number of groups.
     fn group(&mut self, rays: usize) -> usize {
         let most = match self.settings.stop {
             Stop::Likelihood => GAP_M,
@@ -143,8 +142,9 @@ impl LineFinder {
         groups
     }
 
-    /// The standard deviation of a range in metres: from how far each beam is from the lines through its neighbours and through
-    /// those behind them, in the median, which edges and corners do not move. At least that of rounding to the unit of `scan`.
+    /// Returns the standard deviation of a range in meters, at least that of rounding to the unit of `scan`. It is computed from
+    /// the distances of each beam from the lines through its neighbors, and through the beams after these. Edges and corners do
+    /// not change their median.
     fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
         let (mut count, mut first) = (0, 0);
         let steps = self.steps.as_flattened_mut();
@@ -174,7 +174,7 @@ impl LineFinder {
     fn bounds(&self, rays: usize, noise: f64) -> Bounds {
         let Settings { max, min_points, polish, stop } = self.settings;
         let penalty = NUMBERS * (rays.max(2) as f64).ln() * noise * noise;
-        // Where nothing parts points, all of them end on a line.
+        // If no distance separates points, all of them end on a line.
         let (penalty, variance, loss) = match stop {
             Stop::Likelihood => (penalty, noise * noise, LOSS_M * LOSS_M),
             Stop::Number(gap_m) if gap_m.is_finite() => (0.0, f64::INFINITY, LOSS_M * LOSS_M),
@@ -188,26 +188,26 @@ impl LineFinder {
             min_points: usize::from(min_points),
             rounds: if polish { 3 } else { 1 },
             exchange: polish,
-            // So that 19 of 20 beams still end on a line: of rooms drawn as PLE's, .978 do.
+            // 19 of 20 beams still end on a line. In rooms drawn like those of PLE, 97.8 % do.
             trimmed: if polish { rays / 20 } else { 0 },
         }
     }
 }
 
-/// Of a line: its two numbers, and the cut to the next, which may be anywhere and counts twice, as in the criterion of Zhang
-/// and Siegmund (2007) for points of change.
+/// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the criterion of
+/// Zhang and Siegmund (2007) for points of change.
 const NUMBERS: f64 = 4.0;
-/// Points of one line are at most so far apart: PLE's own for real scans.
+/// Maximum distance of neighboring points of one line in meters. PLE uses it for real scans.
 const GAP_M: f64 = 1.0;
-/// Where there are more lines than allowed, leaving out a beam is as bad as an error of this. On logs of four sensors (aces,
-/// Freiburg, Intel, Orebro: `cargo bench --bench perception`) ten vertices cover more beams so than RANSAC's, and fit better.
+/// Error in meters that dropping a beam counts as, if there are more lines than allowed. On logs of four sensors (aces, Freiburg,
+/// Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC, and fit better.
 const LOSS_M: f64 = 0.2;
-/// Lines are neighbours if fewer beams than this are between them.
-const NEIGHBOURS: f32 = 4.5;
-/// Steps of Newton's method towards the likeliest line.
+/// Lines are neighbors if fewer beams than this are between them.
+const NEIGHBORS: f32 = 4.5;
+/// Number of steps of Newton's method to the likeliest line.
 const STEPS: usize = 3;
 
-/// The likeliest line of `piece`; nothing if its rays do not say where it is.
+/// Returns the likeliest line of `piece`; `None` if its rays do not define one.
 fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> Option<Line> {
     let inside = &rays[piece.first..piece.end];
     let (fit, error) = piece.line().refined(inside, STEPS);
@@ -220,7 +220,7 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
     let along =
         |by_a: f64, by_b: f64| (by_a * by_a * aa + 2.0 * by_a * by_b * ab + by_b * by_b * bb).max(0.0).sqrt();
     let alpha_by = (-fit.b / square, fit.a / square);
-    // The sensor sits beside the robot's centre.
+    // The sensor is not at the robot's center.
     let lever = pose.y_m * cos - pose.x_m * sin;
     let r_by = |of: f64, by_alpha: f64| lever * by_alpha - of * of_sensor / square;
     let r = of_sensor + pose.x_m * cos + pose.y_m * sin;
@@ -245,16 +245,16 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
         reserved: 0,
     };
     let numbers = [x1_m, y1_m, x2_m, y2_m, line.r_m, line.alpha_rad, line.sd_r_m, line.sd_alpha_rad];
-    // A direction that could be any is none.
+    // A direction that could be any is not known.
     let is_known = numbers.iter().all(|number| number.is_finite()) && line.sd_alpha_rad < 1.0;
     is_known.then_some(line)
 }
 
-/// Writes where neighbours meet: lines that are certainly not parallel, and that meet where the last beam of the one and the
-/// first of the other look. There both have the same range, so that nothing stands between them.
+/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the directions of the last
+/// beam of the one and the first beam of the other. Both have the same range there, so that no object is between them.
 fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);
-    // The last of a full turn is a neighbour of the first.
+    // In a full revolution, the last line is a neighbor of the first one.
     let pairs = if count > 2 { count } else { count.saturating_sub(1) };
     let looks = |x: f32, y: f32| (y - pose.y_m as f32).atan2(x - pose.x_m as f32);
     let turned = |from: f32, to: f32| (to - from + PI).rem_euclid(TAU) - PI;
@@ -268,7 +268,7 @@ fn corners(out: &mut Lines, pose: &Pose, step: f32) {
         let middle = last + gap / 2.0;
         let range = (x_m - pose.x_m as f32).hypot(y_m - pose.y_m as f32);
         let unsure = 1.5 * step + 3.0 * out.noise_m / range;
-        if gap.abs() <= NEIGHBOURS * step && turned(middle, looks(x_m, y_m)).abs() <= gap.abs() / 2.0 + unsure
+        if gap.abs() <= NEIGHBORS * step && turned(middle, looks(x_m, y_m)).abs() <= gap.abs() / 2.0 + unsure
         {
             out.corner_array[corners] =
                 Corner { x_m, y_m, first_line: first as u16, second_line: second as u16 };
@@ -278,7 +278,7 @@ fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     out.corners = corners as u8;
 }
 
-/// Where two lines meet, if they are certainly not parallel.
+/// Returns the point at which two lines meet, if they are certainly not parallel.
 fn meeting(one: &Line, two: &Line) -> Option<(f32, f32)> {
     let sine = (two.alpha_rad - one.alpha_rad).sin();
     if sine.abs() <= 3.0 * one.sd_alpha_rad.hypot(two.sd_alpha_rad) {

@@ -1,5 +1,5 @@
-//! Finds reflectors: neighbouring beams with a raised intensity become one mark, at their average weighted by
-//! intensity (paper III.B.2). Refuses to know what a mark belongs to, and where the robot is.
+//! Finds reflectors: neighboring beams with a raised intensity become one mark, at their average weighted by intensity
+//! (paper III.B.2).
 
 use std::f64::consts::{PI, TAU};
 
@@ -7,21 +7,21 @@ use scanhub_schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
 
 use crate::directions::exact_angle;
 
-/// What makes a mark.
+/// Settings of a mark detector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// The least level of a beam that belongs to a mark, where intensities are levels of reflectors; 0 is 1.
+    /// Minimum level of a beam of a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
     pub i_min: u8,
-    /// The same where they are the sensor's own counts; without it there are no marks then. 0 is 1.
+    /// Minimum intensity for other scanners. 0 counts as 1; without a value, these have no marks.
     pub level: Option<u16>,
-    /// Ranges of neighbouring beams of a mark differ by at most so much.
+    /// Maximum difference between the ranges of neighboring beams in a mark, in mm.
     pub max_range_step_mm: u16,
-    /// So many beams without enough intensity or a range, one after the other, do not part a mark.
+    /// Maximum number of consecutive beams in a mark that have no range or not enough intensity.
     pub max_gap: u16,
 }
 
 impl Settings {
-    /// As the paper has it.
+    /// Settings of the paper.
     pub const PAPER: Settings = Settings { i_min: 1, level: None, max_range_step_mm: 100, max_gap: 0 };
 }
 
@@ -31,13 +31,13 @@ impl Default for Settings {
     }
 }
 
-/// Finds the marks of one scan; nothing is kept from one to the next.
+/// Finds the marks of each scan. No state is kept from one scan to the next.
 pub struct MarkDetector {
     settings: Settings,
 }
 
 impl MarkDetector {
-    /// A finder that goes by `settings`.
+    /// Creates a detector with these `settings`.
     pub const fn new(settings: Settings) -> MarkDetector {
         MarkDetector { settings }
     }
@@ -52,9 +52,9 @@ impl MarkDetector {
         out.mark_array[usize::from(out.count)..].fill(Mark::default());
     }
 
-    /// The least intensity of a mark of `scan`; why there can be none, as flags.
+    /// Returns the minimum intensity of a mark of `scan`, or the reason why there can be no marks, as flags.
     fn least(&self, scan: &Scan) -> Result<u16, u8> {
-        // The sensor's mode has intensities, and they came.
+        // The scanner's mode must have intensities, and the scan must contain them.
         if scan.intensity_bits == 0 || scan.contents & (Contents::UPPER | Contents::WIDE) == 0 {
             return Err(Marks::UNAVAILABLE);
         }
@@ -64,7 +64,7 @@ impl MarkDetector {
         self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
     }
 
-    /// Writes the marks, of which no beam has an intensity below `least`.
+    /// Writes the marks, whose beams have at least the intensity `least`.
     fn find(&self, scan: &Scan, least: u16, out: &mut Marks) {
         let (mut count, mut overflow) = (0, false);
         let mut push = |open: &Open| match out.mark_array.get_mut(count) {
@@ -102,14 +102,14 @@ impl MarkDetector {
     }
 }
 
-/// A mark that may go on: sums over its beams, in integers, so that they are the same on every machine.
+/// A mark that may get more beams: sums over its beams, in integers, so that they are the same on every machine.
 #[derive(Clone, Copy, Default)]
 struct Open {
     /// Sum of w.
     weight: u64,
     /// Sum of w * i.
     beams: u64,
-    /// Sum of w times how far the exact angle is from that of the beam, in millionths of a degree.
+    /// Sum of w times the difference of the exact angle from that of the beam, in millionths of a degree.
     off_udeg: i64,
     /// Sum of w * r in device units.
     ranges: u64,
@@ -168,8 +168,8 @@ fn in_range_mdeg(mdeg: i128) -> i32 {
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// How far the exact angle of beam `i` is from that of the beam, in millionths of a degree: 0 where there is none. Either may
-/// be counted from another turn.
+/// Returns the difference of the exact angle of beam `i` from that of the beam, in millionths of a degree; 0 without an exact
+/// angle. The angles may differ by whole revolutions.
 fn off_udeg(scan: &Scan, i: usize) -> i64 {
     let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
     let off = exact - (scan.first_angle + i as f64 * scan.step);
@@ -177,7 +177,7 @@ fn off_udeg(scan: &Scan, i: usize) -> i64 {
     (1e6 * in_degrees(off)).round() as i64
 }
 
-/// The whole number next to `sum / weight`, the greater of two.
+/// Returns `sum / weight`, rounded to a whole number. Halves are rounded up.
 fn half_up(sum: u128, weight: u64) -> u128 {
     let weight = u128::from(weight);
     (2 * sum + weight) / (2 * weight)

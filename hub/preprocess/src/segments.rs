@@ -1,6 +1,5 @@
-//! Groups neighbouring foreground beams into segments, and computes where each segment is and whether it is supported: an
-//! edge far away flickers in single beams, an object is seen by several or for longer. Refuses to know why a beam is in the
-//! foreground, and what object a segment is.
+//! Groups neighboring foreground beams into segments, and computes the position of each segment and whether it is supported.
+//! A distant edge flickers in single beams. An object is seen by several beams, or for longer.
 
 use std::f64::consts::{PI, TAU};
 use std::mem::{replace, take};
@@ -16,40 +15,40 @@ use crate::directions::{Directions, exact_angle};
 pub struct Segmenter {
     pose: Pose,
     directions: Directions,
-    /// Of two neighbouring beams.
+    /// Limits for two neighboring beams.
     step: Step,
-    /// The foreground of the scan before.
+    /// Foreground of the previous scan.
     before: Points,
-    /// Room for that of the next scan.
+    /// Memory for that of the next scan.
     room: Points,
 }
 
-/// Points as seen from the sensor, in the directions of the robot's frame, in mm.
+/// Points relative to the sensor, along the axes of the robot's frame, in mm.
 #[derive(Default)]
 struct Points {
     places: Box<[(f64, f64)]>,
     used: usize,
 }
 
-/// What follows from the angle between two points.
+/// Limits that follow from the angle between two points.
 #[derive(Clone, Copy, Default)]
 struct Step {
     /// 2 (1 - cos step), of the law of cosines.
     spread: f64,
-    /// How far apart the two points of one surface are at most, per mm of range.
+    /// Maximum distance of two points of one surface, per mm of range.
     slope: f64,
 }
 
-/// A surface that is seen at a flatter angle than this falls apart into its points.
+/// Minimum angle at which a surface is seen as one segment.
 const FLATTEST_DEG: f64 = 10.0;
-/// Noise of two ranges, on top, in mm.
+/// Additional distance for the noise of two ranges, in mm.
 const NOISE_MM: f64 = 15.0;
-/// A point of the scan before supports a single beam if it is at most so far from it, in mm: who runs at 3 m/s moves by this
-/// between two turns of a scanner that turns ten times a second.
+/// Maximum distance of a point of the previous scan that supports a single beam, in mm. A person who runs at 3 m/s moves by
+/// this distance in one revolution of a scanner at 10 Hz.
 const REACH_MM: f64 = 300.0;
 
 impl Segmenter {
-    /// For a sensor that sits at `pose` and has at most `beams` beams.
+    /// Creates a segmenter for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, beams: usize) -> Segmenter {
         let points = || vec![(0.0, 0.0); beams].into();
         let [before, room] = [points(), points()].map(|places| Points { places, used: 0 });
@@ -105,7 +104,7 @@ impl Segmenter {
         self.room = replace(&mut self.before, now);
     }
 
-    /// As [`update`](Self::update) for a foreground of which nobody wants the segments: what supports the next ones is remembered.
+    /// Stores the points of a `foreground` that support the next segments, like [`update`](Self::update), but finds no segments.
     pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
         let mut now = take(&mut self.room);
@@ -116,13 +115,14 @@ impl Segmenter {
         self.room = replace(&mut self.before, now);
     }
 
-    /// Says of each beam whose bit is set its `ranges`, in mm too and with its exact angle, if it has one, and its point.
+    /// Calls `visit` with each beam whose bit is set: its number, its range in device units, its range in mm with its exact angle if
+    /// it has one, and its point.
     fn each_point(
         &self,
         scan: &Scan,
         bits: &[u8],
         ranges: &[u16],
-        mut say: impl FnMut(usize, u16, (f64, Option<f64>), (f64, f64)),
+        mut visit: impl FnMut(usize, u16, (f64, Option<f64>), (f64, f64)),
     ) {
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
         let (mut ranges, exact_angles) = (ranges.iter(), scan.exact_angles());
@@ -137,12 +137,13 @@ impl Segmenter {
                 let range_mm = f64::from(range) * unit_mm;
                 let exact = exact_angle(exact_angles, beam);
                 let (x, y) = exact.map_or(on_grid, |exact| self.pose.direction(exact));
-                say(beam, range, (range_mm, exact), (range_mm * x, range_mm * y));
+                visit(beam, range, (range_mm, exact), (range_mm * x, range_mm * y));
             }
         }
     }
 
-    /// A point at `next_mm` on the next beam, and at this `exact` angle, belongs to the last one of `open`.
+    /// Returns whether a point at `next_mm` on the next beam, with this `exact` angle, belongs to the same segment as the last point
+    /// of `open`.
     fn joins(&self, open: &Open, (next_mm, exact): (f64, Option<f64>)) -> bool {
         let range_mm = open.last_mm;
         let step = open.last_exact.zip(exact).map_or(self.step, |(last, next)| Step::of(next - last));
@@ -159,7 +160,7 @@ impl Segmenter {
 }
 
 impl Points {
-    /// There is room for a point of each beam of a scan.
+    /// Adds a point. There is memory for one of each beam.
     fn add(&mut self, point: (f64, f64)) {
         if let Some(place) = self.places.get_mut(self.used) {
             *place = point;
@@ -167,7 +168,7 @@ impl Points {
         }
     }
 
-    /// One of them is near enough to `point` to support it.
+    /// Returns whether one of the points is near enough to `point` to support it.
     fn reach(&self, point: (f64, f64)) -> bool {
         let apart = |other: &(f64, f64)| {
             let (dx, dy) = (other.0 - point.0, other.1 - point.1);
@@ -178,25 +179,25 @@ impl Points {
 }
 
 impl Step {
-    /// Of points so many radians apart, either way, and perhaps a turn more.
+    /// Returns the limits for two points that are `radians` apart in either direction, perhaps plus whole revolutions.
     fn of(radians: f64) -> Step {
         let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
         let spread = 2.0 * (1.0 - step.cos());
-        // Steps of 10 degrees and more are no scanner's; nothing but the noise joins them.
+        // No scanner has steps of 10 degrees or more. Only the noise can join them.
         let flattest = FLATTEST_DEG.to_radians();
         let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
         Step { spread, slope }
     }
 }
 
-/// A segment that may go on.
+/// A segment that may get more beams.
 struct Open {
     first: usize,
     last: usize,
     nearest: u16,
     last_mm: f64,
     last_exact: Option<f64>,
-    /// As seen from the sensor, in the directions of the robot's frame.
+    /// Relative to the sensor, along the axes of the robot's frame.
     first_point: (f64, f64),
     last_point: (f64, f64),
     sum: (f64, f64),

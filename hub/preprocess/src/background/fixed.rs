@@ -112,7 +112,7 @@ struct Bounds {
 }
 
 impl Multi {
-    /// For so many beams at most.
+    /// Creates the state for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Multi {
         let all = |value: u16| vec![value; beams].into_boxed_slice();
         Multi {
@@ -124,7 +124,7 @@ impl Multi {
         }
     }
 
-    /// As it was when it was new.
+    /// Restores the initial state.
     pub(super) fn forget(&mut self) {
         self.slots.iter_mut().for_each(|slots| {
             slots.range.fill(0);

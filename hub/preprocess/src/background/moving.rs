@@ -1,6 +1,6 @@
-//! A background for a scanner that moves: a map of what stands around the robot, which scrolls with it. A beam that ends in
-//! space that was seen free is in the foreground; shadows and the edge of what was seen are unknown. Refuses to know how
-//! the robot's place is found: each scan comes with it.
+//! A background for a scanner that moves: a map of the objects around the robot that stand, which scrolls with it. A beam that
+//! ends in space that was seen free is in the foreground. Shadows, and the edge of the space that was seen, are unknown. The
+//! robot's position comes with each scan.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -13,9 +13,9 @@ use crate::velocity::{Rigid, Velocity};
 /// State of the method that follows the robot.
 #[derive(Clone)]
 pub(super) struct Moving {
-    /// Square cells around the robot; the cell of a place is that of its coordinates modulo the width.
+    /// Square cells around the robot. The index of a cell is its coordinates modulo the width.
     cells: Box<[Cell]>,
-    /// What happened to each cell in the last scan that met it: see [`Mark`].
+    /// Effect of the last scan that met each cell, see [`Mark`].
     marks: Box<[u8]>,
     /// The cell of the robot, in the middle of those that are kept.
     middle: (i32, i32),
@@ -23,25 +23,25 @@ pub(super) struct Moving {
     scan: u8,
     /// Positions of the sensor at the times of the beams, in cells, while a scan is processed.
     starts: Box<[(f32, f32)]>,
-    /// Where the beams end, in cells, while a scan is looked at.
+    /// Ends of the beams in cells, while a scan is processed.
     ends: Box<[(f32, f32)]>,
     runs: Runs,
 }
 
-/// What is known of a square of the floor.
+/// A square of the floor.
 #[derive(Clone, Copy, Default)]
 struct Cell {
-    /// Scans in which a beam ended here, less those that saw through it since.
+    /// Number of scans in which a beam ended here, less the later ones that saw through it.
     hits: u16,
-    /// Scans that saw through it, less an eighth of those in which a beam ended here.
+    /// Number of scans that saw through it, less an eighth of those in which a beam ended here.
     free: u16,
-    /// Times that a beam ended here after others had seen through: legs of chairs are thinner than the distance of two beams.
+    /// Number of times that a beam ended here after others had seen through. Chair legs are thinner than the distance of two beams.
     returns: u8,
-    /// Scans in a row that saw through it.
+    /// Number of consecutive scans that saw through it.
     through: u8,
 }
 
-/// Where the sensor is in the map, and where it looks.
+/// Position of the robot and its sensor in the map, and the directions of the beams.
 #[derive(Clone, Copy)]
 struct Place {
     robot: Rigid,
@@ -55,20 +55,20 @@ struct Place {
     unit_m: f64,
 }
 
-/// What a scan did to a cell, in a byte: three times the number of the scan, and this.
+/// Effect of a scan on a cell, in a byte: three times the number of the scan, plus one of these values.
 struct Mark;
 
 impl Mark {
-    /// So many scans have numbers.
+    /// Number of scans that fit into the byte.
     const SCANS: u8 = 84;
     const THROUGH: u8 = 0;
-    /// A beam ended beside it.
+    /// A beam ended next to it.
     const NEAR: u8 = 1;
     const ENDED: u8 = 2;
 }
 
 impl Moving {
-    /// For so many beams at most.
+    /// Creates the state for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Moving {
         Moving {
             cells: vec![Cell::default(); CELLS].into(),
@@ -82,7 +82,7 @@ impl Moving {
         }
     }
 
-    /// As it was when it was new.
+    /// Restores the initial state.
     pub(super) fn forget(&mut self) {
         self.cells.fill(Cell::default());
         self.runs.forget();
@@ -97,13 +97,13 @@ impl Moving {
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         let velocity = velocity.of_sensor(pose);
         self.place = is_known.then_some(Place { robot, x, y, pose: *pose, velocity, angles, unit_m });
-        // Along a corridor every place looks alike.
+        // Along a corridor, all positions look alike.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
         let is_sure = motion.is_degenerate() || variance <= UNSURE_M * UNSURE_M;
         is_known && motion.has_step() && is_sure
     }
 
-    /// Compares all beams with the map before this scan, then lays the scan into it.
+    /// Compares all beams with the map before this scan, then adds the scan to the map.
     pub(super) fn update(
         &mut self,
         scan: &Scan,
@@ -144,7 +144,7 @@ impl Moving {
         }
     }
 
-    /// What a beam is that ends in this cell.
+    /// Returns the class of a beam that ends in this cell.
     fn class(&self, x: i32, y: i32, limits: &Limits) -> Class {
         if !self.is_inside(x, y, AROUND) {
             return Class::Unknown;
@@ -163,7 +163,7 @@ impl Moving {
         if is_free { Class::Foreground } else { Class::Unknown }
     }
 
-    /// Keeps the cells around `middle`, and forgets those that are new among them.
+    /// Moves the map to `middle`, and clears the cells that are new in it.
     fn scroll(&mut self, middle: (i32, i32)) {
         let (dx, dy) = (middle.0 - self.middle.0, middle.1 - self.middle.1);
         if dx.abs() >= WIDTH || dy.abs() >= WIDTH {
@@ -183,14 +183,14 @@ impl Moving {
         self.middle = middle;
     }
 
-    /// Whether a cell is kept, and so many around it.
+    /// Returns whether a cell is in the map, and `around` cells on each side of it.
     fn is_inside(&self, x: i32, y: i32, around: i32) -> bool {
         let half = WIDTH / 2 - around;
         let is_near = |at: i32, middle: i32| (middle - half..middle + half).contains(&at);
         is_near(x, self.middle.0) && is_near(y, self.middle.1)
     }
 
-    /// Lays the scan into the map: each cell counts once, and where a beam ended no other sees through.
+    /// Adds the scan to the map. Each cell counts once, and a beam that ended in a cell outweighs those that saw through it.
     fn lay(&mut self, beams: usize, limits: &Limits) {
         self.scan = if self.scan >= Mark::SCANS { 1 } else { self.scan + 1 };
         if self.scan == 1 {
@@ -198,7 +198,7 @@ impl Moving {
         }
         let (near, ended) = (3 * self.scan + Mark::NEAR, 3 * self.scan + Mark::ENDED);
         let most = limits.scans.max(FREE);
-        // Those that ended, before those that were seen through.
+        // The ends of all beams are added before the cells that they saw through.
         for i in 0..beams {
             let (x, y) = self.ends[i];
             let (x, y) = (x.floor() as i32, y.floor() as i32);
@@ -218,7 +218,7 @@ impl Moving {
             }
             self.marks[at] = ended;
         }
-        // Counted from the first cell that is kept, no place is below 0.
+        // Relative to the first cell of the map, no coordinate is negative.
         let first = ((self.middle.0 - WIDTH / 2) as f32, (self.middle.1 - WIDTH / 2) as f32);
         for i in 0..beams {
             let (start, end) = (self.starts[i], self.ends[i]);
@@ -229,7 +229,7 @@ impl Moving {
         }
     }
 
-    /// Counts the cells from the sensor to short of where a beam ended, in steps of less than a cell.
+    /// Counts the cells between the sensor and the end of a beam, in steps of at most one cell.
     fn see_through(&mut self, from: (f32, f32), end: (f32, f32), most: u16) {
         let through = 3 * self.scan + Mark::THROUGH;
         let (dx, dy) = (end.0 - from.0, end.1 - from.1);
@@ -247,7 +247,7 @@ impl Moving {
                 return;
             }
             let at = (wrapped(first.0 + column) * WIDTH + wrapped(first.1 + row)) as usize;
-            // Else this scan has said something of it.
+            // A greater mark is from this scan already.
             if self.marks[at] < through {
                 self.marks[at] = through;
                 self.cells[at].seen_through(most);
@@ -255,7 +255,7 @@ impl Moving {
         }
     }
 
-    /// What the beam with number `i` would end on if nothing were in the foreground, in device units.
+    /// Returns the range of beam `i` without a foreground, in device units.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let Some(place) = self.place.filter(|place| place.unit_m > 0.0) else { return Background::UNTAUGHT };
         let along = place.along(place.angles.0 + i as f64 * place.angles.1);
@@ -275,7 +275,7 @@ impl Moving {
 }
 
 impl Cell {
-    /// Something stands here: it was there before the place was seen free, or for as long as it takes.
+    /// Returns whether an object stands in the cell. It must have stood there before the cell was seen free, or for long enough.
     fn stands(&self, limits: &Limits) -> bool {
         self.hits >= STANDS && self.free < FREE
             || self.hits >= limits.scans.max(STANDS)
@@ -302,7 +302,7 @@ impl Cell {
 }
 
 impl Place {
-    /// Where a beam at the sensor's `angle` points in the map.
+    /// Returns the direction in the map of a beam at the sensor's `angle`.
     fn along(&self, angle: f64) -> (f64, f64) {
         self.robot.turned(self.pose.direction(angle))
     }
@@ -313,33 +313,34 @@ fn in_cells((x, y): (f64, f64)) -> (f32, f32) {
     ((x / CELL_M) as f32, (y / CELL_M) as f32)
 }
 
-/// The cell of a coordinate in metres.
-fn cell(metres: f64) -> i32 {
-    (metres / CELL_M).floor() as i32
+/// Returns the cell of a coordinate in meters.
+fn cell(meters: f64) -> i32 {
+    (meters / CELL_M).floor() as i32
 }
 
-/// Where a cell is kept.
+/// Returns the index of a cell.
 fn index(x: i32, y: i32) -> usize {
     (x.rem_euclid(WIDTH) * WIDTH + y.rem_euclid(WIDTH)) as usize
 }
 
-/// Width of a cell: people are several cells wide, and a place is known to less than one.
+/// Width of a cell in meters. People are several cells wide, and a position is known to less than one.
 const CELL_M: f64 = 0.05;
-/// Cells on each side of the square that is kept: 40 m.
+/// Number of cells on each side of the map: 40 m.
 const WIDTH: i32 = 800;
 const CELLS: usize = (WIDTH * WIDTH) as usize;
-/// Cells around the end of a beam in which it may be that something stands: what a place and a wall are unsure by.
+/// Number of cells around the end of a beam in which an object may stand: the uncertainty of a position and of a wall.
 const AROUND: i32 = 2;
-/// Scans that see through a cell until it is free.
+/// Number of scans that must see through a cell until it is free.
 const FREE: u16 = 5;
-/// Beams that end in a cell until something stands there that was never seen free.
+/// Number of beams that must end in a cell that was never seen free, until an object stands there.
 const STANDS: u16 = 3;
-/// Returns from which on something thin stands in a cell, and scans in a row that see through it after which nothing does.
+/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that see through it after which
+/// it does not.
 const RETURNS: u8 = 24;
 const LONG: u8 = 60;
-/// Cells before the end of a beam that it says nothing of.
+/// Number of cells before the end of a beam that do not count as seen free.
 const SHORT: f32 = 2.5;
-/// A map does not go on by a step that is less sure than this: walls would stand where there are none.
+/// Maximum standard deviation of a step with which the map continues. Otherwise, walls would appear in free space.
 const UNSURE_M: f64 = CELL_M;
-/// Farther from its start no robot gets without a new one.
+/// Maximum distance of a robot from its start.
 const FARTHEST_M: f64 = 1e6;

@@ -1,14 +1,13 @@
-//! The line on which some beams end: the one that their radial noise makes most likely. Refuses to know which beams belong
-//! together.
+//! Fits a line to some beams: the one that their radial noise makes most likely.
 //!
 //! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
 //! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
-//! their beams, so the likeliest line has the least sum of squares of (measured range - range of the line). That sum is not
-//! linear in a and b; range^2 (a cos + b sin) - range is, and is the same up to the factor measured / true range. Sums over
-//! it are added and taken away beam by beam ([`Sums`]); from its line, a few steps of Newton's method as Gauss has it lead
-//! to the likeliest ([`Line::refined`]).
+//! their beams, so the likeliest line has the minimum sum of squares of (measured range - range of the line). That difference
+//! is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same up to the factor
+//! measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead from its line to the
+//! likeliest one ([`Line::refined`]).
 
-/// A beam that returned: its direction as a unit vector, and its range in metres.
+/// A beam that has a range: its direction as a unit vector, and its range in meters.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Ray {
     pub(super) cos: f64,
@@ -17,7 +16,7 @@ pub(super) struct Ray {
 }
 
 impl Ray {
-    /// Returns how far the ends of two rays are apart, in metres.
+    /// Returns the distance between the ends of two rays in meters.
     pub(super) fn apart(&self, other: &Ray) -> f64 {
         let (x, y) = (
             self.range * self.cos - other.range * other.cos,
@@ -27,7 +26,7 @@ impl Ray {
     }
 }
 
-/// A line by where beams meet it, in 1/m.
+/// A line by the inverse ranges at which beams meet it, in 1/m.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Line {
     pub(super) a: f64,
@@ -35,7 +34,7 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// Returns the inverse of the range at which `ray` meets the line; not above 0 if it does not.
+    /// Returns the inverse of the range at which `ray` meets the line. It is not positive if the ray does not meet the line.
     pub(super) fn inverse(&self, ray: &Ray) -> f64 {
         self.a * ray.cos + self.b * ray.sin
     }
@@ -65,7 +64,7 @@ impl Line {
     pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (Line, f64) {
         let (mut line, mut error) = (self, self.error(rays));
         if let [first, .., last] = rays {
-            // A surface that is seen very flatly: the sums may have led behind the sensor.
+            // If a surface is seen at a very flat angle, the line of the sums may be behind the sensor.
             let through = Line::through(first, last);
             let alternative = through.error(rays);
             if alternative < error {
@@ -93,10 +92,10 @@ impl Line {
     }
 }
 
-/// No scanner sees as far: 10 km.
+/// Inverse of a range beyond that of every scanner: 10 km.
 const FARTHEST: f64 = 1e-4;
 
-/// What the rays say of a line near one: the sums of the squares of the slopes, and of slope times difference.
+/// Information of rays about a line: the sums of the products of slopes, and of slope times difference.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Information {
     aa: f64,
@@ -107,7 +106,7 @@ pub(super) struct Information {
 }
 
 impl Information {
-    /// Returns it for `line`; nothing if a ray does not meet it.
+    /// Returns the information about `line`; `None` if a ray does not meet it.
     pub(super) fn of(line: &Line, rays: &[Ray]) -> Option<Information> {
         let mut sums = Information::default();
         for ray in rays {
@@ -127,7 +126,7 @@ impl Information {
         Some(sums)
     }
 
-    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; nothing if all rays are one.
+    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; `None` if all rays have one direction.
     pub(super) fn inverse(&self, variance: f64) -> Option<(f64, f64, f64)> {
         let (product, det) = (self.aa * self.bb, self.aa * self.bb - self.ab * self.ab);
         let scale = variance / det;
@@ -144,7 +143,7 @@ impl Information {
     }
 }
 
-/// Sums over rays, of which line and error follow.
+/// Sums over rays, from which line and error are computed.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sums {
     cc: f64,
@@ -169,7 +168,7 @@ impl Sums {
         Sums { cc: c * c, cs: c * s, ss: s * s, c: c * ray.range, s: s * ray.range, square, count: 1.0 }
     }
 
-    /// Returns the line of least error.
+    /// Returns the line with the minimum error.
     pub(super) fn line(&self) -> Line {
         let det = self.cc * self.ss - self.cs * self.cs;
         Line {

@@ -126,7 +126,7 @@ impl Piece {
         Piece { first, end, sums, error: sums.error(), is_last }
     }
 
-    /// Returns the line of least error.
+    /// Returns the line with the minimum error.
     pub(super) fn line(&self) -> Line {
         self.sums.line()
     }

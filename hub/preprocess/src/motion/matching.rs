@@ -11,28 +11,28 @@ use super::covariance::{Square, add_outer, around, eigen};
 use crate::directions::Directions;
 use crate::velocity::{Rigid, is_whole};
 
-/// How one scan lies on another.
+/// Position of one scan relative to another.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Match {
     pub(super) place: Rigid,
-    /// How unsure that is by the noise of the scan, and by that of the one on which it lies.
+    /// Covariance of the position by the noise of the scan, and by that of the kept one.
     pub(super) own: Square,
     pub(super) of_kept: Square,
     /// Share of the readings that lie on surfaces.
     pub(super) overlap: f64,
     /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits better.
     pub(super) weight: f64,
-    /// Some direction is not known.
+    /// Whether a direction of the position is not known.
     pub(super) is_degenerate: bool,
-    /// Corners of both are the same.
+    /// Whether the scans have a corner in common.
     pub(super) has_corners: bool,
-    /// Lines of both are the same.
+    /// Whether the scans have a line in common.
     pub(super) has_lines: bool,
 }
 
-/// Lays scans onto others.
+/// Matches scans.
 pub(super) struct Matcher {
-    /// For each reading: 0 if it is of something that stands, else how long what it shows is not to be trusted.
+    /// By reading: 0 for an object that stands, otherwise the number of kept scans for which a moving object is ignored.
     doubts: Box<[u8]>,
     runs: Box<[Run]>,
 }
@@ -41,60 +41,61 @@ pub(super) struct Matcher {
 #[derive(Clone, Copy, Default)]
 struct Run {
     first: u16,
-    /// Its readings.
+    /// Number of readings.
     all: u16,
-    /// Those that are where nothing was before.
+    /// Readings in space that was empty before.
     come: u16,
-    /// Those that lie on what was not trusted before, and how long that is not.
+    /// Readings on objects that moved before, and the maximum time for which these are ignored.
     doubted: u16,
     doubt: u8,
-    /// Those that are near a surface.
+    /// Readings near a surface.
     beams: u16,
-    /// Of squares of what they are off, in variances of their noise.
+    /// Sum of their squared distances from the surface, in variances of their noise.
     off: f64,
 }
 
-/// What all beams say together.
+/// Sums over beams near surfaces.
 #[derive(Default)]
 struct Sums {
-    /// Of weights times (nx, ny, n x p / scale) in both directions: a number of beams that look at a wall.
+    /// Sum of the weights times v v', where v is (nx, ny, n x p / scale): the number of beams that meet walls across each
+    /// direction.
     weight: Square,
     slope: [f64; 3],
-    /// What unsure surfaces add to it by mere chance.
+    /// Part of `weight` that surfaces of uncertain direction add by chance.
     chance: f64,
     own: Square,
     of_kept: Square,
-    /// Of squares of what beams are off, and of what they are off by noise alone.
+    /// Sums of the squared distances of the beams, and of the variances by noise alone.
     off: f64,
     expected: f64,
     weights: f64,
     beams: usize,
 }
 
-/// The directions in which the surroundings say where the robot is.
+/// Directions in which the surroundings define the position.
 struct Known {
     values: [f64; 3],
     vectors: [[f64; 3]; 3],
-    /// It is said by a few beams, or none.
+    /// Whether enough beams meet walls across it to be better than a guess.
     is_said: [bool; 3],
-    /// It is said by enough beams to be believed.
+    /// Whether enough beams meet walls across it.
     is_known: [bool; 3],
 }
 
 impl Matcher {
-    /// For so many beams at most.
+    /// Allocates a matcher for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Matcher {
         Matcher { doubts: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
-    /// How `now` lies on `kept`, near `begin`; nothing if too few beams say so. Where the surroundings say nothing, the place
-    /// is that of `begin`, and unsure by `unknown_m`.
+    /// Returns the position of `now` relative to `kept`, near `begin`; `None` if too few beams match. In directions that the
+    /// surroundings do not define, the position is that of `begin`, with a standard deviation of `unknown_m`.
     pub(super) fn find(&mut self, kept: &View, now: &View, begin: Rigid, unknown_m: f64) -> Option<Match> {
         self.trust_all();
         let pair = Pair { kept, now, scale: scale(now)?, finest: WIDTH * kept.noise.hypot(now.noise) };
         let mut place = pair.settle(begin, FIRST_M, &self.doubts);
         for _ in 0..LOOKS {
-            if !self.leave_out(&pair, &place) {
+            if !self.mark_moving(&pair, &place) {
                 break;
             }
             place = pair.settle(place, 0.0, &self.doubts);
@@ -120,20 +121,24 @@ impl Matcher {
         (is_finite && place.x.is_finite() && place.y.is_finite() && place.yaw.is_finite()).then_some(found)
     }
 
-    /// For each reading of the scan that was laid last: 0 if it is of something that stands, else for how many kept scans
-    /// what it shows is not to be trusted.
+    /// Returns, by reading of the last scan, 0 for an object that stands, otherwise the number of kept scans for which a moving
+    /// object is ignored.
     pub(super) fn doubts(&self) -> &[u8] {
         &self.doubts
     }
 
-    /// Nothing is known to move.
+    /// Resets the matcher: no object is known to move.
     pub(super) fn trust_all(&mut self) {
         self.doubts.fill(0);
     }
 
-    /// Leaves out what moves: neighbouring readings that are off by more than their noise together, though none need be alone;
-    /// most of which are where nothing was; or which are of what moved before. Whether there were others than before.
-    fn leave_out(&mut self, pair: &Pair<'_>, place: &Rigid) -> bool {
+    /// Marks readings of moving objects, and returns whether other readings than before are marked. A run of neighboring readings
+    /// is marked if one of these is true:
+    ///
+    /// - Together, they are farther from surfaces than their noise.
+    /// - Most of them lie in space that was empty before.
+    /// - Most of them lie on objects that moved before.
+    fn mark_moving(&mut self, pair: &Pair<'_>, place: &Rigid) -> bool {
         let width = 2.0 * pair.finest;
         let beams = pair.now.points().len();
         let (mut runs, mut off, mut expected) = (0, 0.0, 0.0);
@@ -162,7 +167,7 @@ impl Matcher {
         for at in 0..runs {
             let end = if at + 1 < runs { self.runs[at + 1].first.into() } else { beams };
             let run = self.runs[at];
-            // The sum of squares has twice as much variance as beams.
+            // The variance of the sum of squares is twice the number of beams.
             let n = f64::from(run.beams);
             let is_off = run.off > level * (MORE * n + 4.0 * (2.0 * n).sqrt());
             let doubt = match is_off || 2 * run.come > run.all {
@@ -179,24 +184,24 @@ impl Matcher {
     }
 }
 
-/// Two scans, of which one is laid onto the other.
+/// Two scans that are matched.
 struct Pair<'a> {
     kept: &'a View,
     now: &'a View,
     /// See [`scale`].
     scale: f64,
-    /// At last beams are off by less than this.
+    /// Maximum distance of a beam from its surface in the last rounds, in meters.
     finest: f64,
 }
 
-/// How a beam ends near a surface.
+/// A beam that ends near a surface.
 struct On {
     point: (f64, f64),
     surface: Surface,
     off: f64,
-    /// The surface is of what moves.
+    /// Whether the surface belongs to a moving object.
     is_doubted: bool,
-    /// Of `off`, by the noise of the scan and by that of the kept one.
+    /// Variance of `off` by the noise of the scan, and by that of the kept one.
     by_now: f64,
     by_kept: f64,
 }
@@ -208,7 +213,7 @@ impl On {
 }
 
 impl Pair<'_> {
-    /// Where `now` lies, if it begins near `place` and beams may be off by `width` at first.
+    /// Returns the position of `now`, starting at `place` with beams that are at most `width` away from surfaces.
     fn settle(&self, mut place: Rigid, width: f64, doubts: &[u8]) -> Rigid {
         let mut width = width.max(self.finest);
         let coarse = self.now.points().len().div_ceil(COARSE);
@@ -227,16 +232,16 @@ impl Pair<'_> {
         place
     }
 
-    /// The share of the readings that are near a surface.
+    /// Returns the share of the readings that are near a surface.
     fn overlap(&self, place: &Rigid) -> f64 {
         let beams = self.now.points().len();
         (0..beams).filter(|&i| self.on(i, place, self.finest).is_some()).count() as f64 / beams as f64
     }
 
-    /// How reading `i` ends, if it ends less than `width` from a surface.
+    /// Returns reading `i` if it is less than `width` away from a surface.
     fn on(&self, i: usize, place: &Rigid, width: f64) -> Option<On> {
         let (reading, point) = (&self.now.readings()[i], place.point(self.now.points()[i]));
-        // A neighbour of the beam that would meet this very point may be as far away as beams are.
+        // The beam nearest to the point may end as far from it as neighboring beams are apart.
         let on = &self.kept.readings()[self.kept.nearest(point, width + SPACING_M)?];
         let surface = on.surface?;
         let off = surface.off(point);
@@ -244,7 +249,7 @@ impl Pair<'_> {
         let deviations =
             (along(place.turned(reading.direction)) * self.now.noise, along(on.direction) * self.kept.noise);
         let (by_now, by_kept) = (deviations.0 * deviations.0, deviations.1 * deviations.1);
-        // A surface that is seen from its edge varies across the beams, too.
+        // A surface that is seen edge-on also varies across the beams.
         let least = LEAST_SHARE * (self.now.noise * self.now.noise);
         (off.abs() < width).then_some(On {
             point,
@@ -256,13 +261,14 @@ impl Pair<'_> {
         })
     }
 
-    /// Of each `stride`th beam at `place`, if it is off by less than `width` and of nothing that moves.
+    /// Returns the sums over every `stride`th beam at `place` that is less than `width` away from a surface and not on a moving
+    /// object.
     fn sums(&self, place: &Rigid, width: f64, stride: usize, doubts: &[u8]) -> Sums {
         let mut sums = Sums::default();
         for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| doubts[i] == 0) {
             let Some(on) = self.on(i, place, width).filter(|on| !on.is_doubted) else { continue };
             let (share, off) = (on.off / width, on.off);
-            // Tukey's.
+            // Tukey's biweight.
             let weight = (1.0 - share * share) * (1.0 - share * share);
             let ((nx, ny), (x, y)) = (on.surface.normal, on.point);
             let row = [nx, ny, (ny * x - nx * y) / self.scale];
@@ -282,7 +288,8 @@ impl Pair<'_> {
     }
 }
 
-/// How far away the beams of `now` end, so that a turn by one over it moves them by about a metre; nothing if none has a range.
+/// Returns the root mean square distance of the points of `now`, so that a turn by its inverse moves them by about one meter.
+/// `None` if there are no points.
 fn scale(now: &View) -> Option<f64> {
     let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
     let scale = (square / now.points().len().max(1) as f64).sqrt();
@@ -290,7 +297,7 @@ fn scale(now: &View) -> Option<f64> {
 }
 
 impl Known {
-    /// A direction is known if enough beams look at walls across it, beside what chance adds.
+    /// A direction is known if enough beams meet walls across it, not counting the part that chance adds.
     fn of(sums: &Sums, stride: usize) -> Known {
         let (values, vectors) = eigen(sums.weight);
         let least = (LEAST_BEAMS as f64 / stride as f64).max(LEAST_PART * sums.weights);
@@ -299,7 +306,7 @@ impl Known {
         Known { values, vectors, is_said, is_known: said.map(|beams| beams >= least) }
     }
 
-    /// The step against `slope`, along what is said.
+    /// Returns the step against `slope`, along directions with enough beams.
     fn solve(&self, slope: &[f64; 3]) -> [f64; 3] {
         let mut step = [0.0; 3];
         for ((value, vector), is_said) in self.values.iter().zip(&self.vectors).zip(self.is_said) {
@@ -311,9 +318,9 @@ impl Known {
         step
     }
 
-    /// How unsure a place is by the noise of the scan and by that of the kept one, in metres and radians.
+    /// Returns the covariance of the position by the noise of the scan, and by that of the kept one, in meters and radians.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
-        // Where beams are off by more than their noise, all is less sure.
+        // If beams are off by more than their noise, the position is less certain.
         let factor = (sums.off / sums.expected).max(1.0);
         let inverse = self.inverse();
         let of_radians = [1.0, 1.0, 1.0 / scale];
@@ -341,7 +348,7 @@ impl Known {
     }
 }
 
-/// Whether a corner of `now` at `place` is one of `kept`.
+/// Returns whether a corner of `now` at `place` is one of `kept`.
 fn same_corners(kept: &View, now: &View, place: &Rigid) -> bool {
     let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
     let is_same = |corner: &Corner| {
@@ -352,7 +359,7 @@ fn same_corners(kept: &View, now: &View, place: &Rigid) -> bool {
     now.lines.corners().iter().any(is_same)
 }
 
-/// Whether a line of `now` at `place` is one of `kept`: both of its ends lie on that, and they overlap.
+/// Returns whether a line of `now` at `place` is one of `kept`: both of its ends lie on that line, and the two overlap.
 fn same_lines(kept: &View, now: &View, place: &Rigid) -> bool {
     let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
     let is_same = |line: &Line| {
@@ -374,47 +381,47 @@ fn same_lines(kept: &View, now: &View, place: &Rigid) -> bool {
     now.lines.lines().iter().any(is_same)
 }
 
-/// The readings of one scan.
+/// Readings of one scan, with their surfaces and lines.
 pub(super) struct View {
     pose: Pose,
     /// First angle, step and number of the beams.
     grid: (f64, f64, usize),
     directions: Directions,
-    /// Where the beams end that have a range, in the robot's frame, in the order of the beams.
+    /// Points of the readings in the robot's frame, in the order of the beams.
     points: Box<[(f64, f64)]>,
     readings: Box<[Reading]>,
     count: usize,
-    /// The first reading at or behind each beam.
+    /// Index of the first reading at or after each beam.
     slots: Box<[u16]>,
     pub(super) lines: Lines,
-    /// Standard deviation of a range, in metres.
+    /// Standard deviation of a range in meters.
     pub(super) noise: f64,
 }
 
-/// One of the beams that have a range.
+/// A beam that has a range.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Reading {
     pub(super) beam: u16,
-    /// Where the beam points, in the robot's frame.
+    /// Direction of the beam in the robot's frame, as a unit vector.
     pub(super) direction: (f64, f64),
-    /// Metres from the sensor.
+    /// Range in meters.
     pub(super) range: f64,
     pub(super) surface: Option<Surface>,
-    /// What it shows was seen to move; so many kept scans later it is trusted again. 0: it stands.
+    /// Number of kept scans for which its object is ignored, because it was seen to move; 0 if it stands.
     pub(super) doubt: u8,
 }
 
-/// A plane: x nx + y ny = r.
+/// A plane across the floor: x nx + y ny = r.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Surface {
     pub(super) normal: (f64, f64),
     pub(super) r: f64,
-    /// Variance of its direction, in rad2.
+    /// Variance of its direction in rad2.
     pub(super) variance: f64,
 }
 
 impl View {
-    /// For so many beams at most.
+    /// Allocates a view of at most `beams` beams.
     pub(super) fn new(beams: usize) -> View {
         View {
             pose: Pose::default(),
@@ -429,7 +436,7 @@ impl View {
         }
     }
 
-    /// Takes over `scan` of a sensor at `pose`, and its `lines`.
+    /// Replaces the content by `scan` of a sensor at `pose`, and its `lines`.
     pub(super) fn take(&mut self, pose: &Pose, scan: &Scan, lines: &Lines) {
         self.lines = *lines;
         let noise = f64::from(lines.noise_m);
@@ -448,16 +455,16 @@ impl View {
             self.count += 1;
         }
         self.slots[next..self.grid.2].fill(self.count as u16);
-        self.lay_on_lines();
+        self.set_surfaces_of_lines();
         for i in 0..self.count {
             if self.readings[i].surface.is_none() {
-                self.readings[i].surface = self.among_neighbours(i);
+                self.readings[i].surface = self.among_neighbors(i);
             }
         }
     }
 
-    /// The readings on a line lie on that, but for those that are far from it.
-    fn lay_on_lines(&mut self) {
+    /// Sets the surface of the readings of each line, except of those that are far from it.
+    fn set_surfaces_of_lines(&mut self) {
         for line in self.lines.lines() {
             let alpha = f64::from(line.alpha_rad);
             let (sin, cos) = alpha.sin_cos();
@@ -477,13 +484,13 @@ impl View {
         }
     }
 
-    /// The surface through reading `i` and its neighbours, if they lie on one.
-    fn among_neighbours(&self, i: usize) -> Option<Surface> {
+    /// Returns the surface through reading `i` and its neighbors, if they lie on one.
+    fn among_neighbors(&self, i: usize) -> Option<Surface> {
         let (mut first, mut last) = (i, i);
-        while first > 0 && i - first < NEIGHBOURS && self.is_connected(first) {
+        while first > 0 && i - first < NEIGHBORS && self.is_connected(first) {
             first -= 1;
         }
-        while last + 1 < self.count && last - i < NEIGHBOURS && self.is_connected(last + 1) {
+        while last + 1 < self.count && last - i < NEIGHBORS && self.is_connected(last + 1) {
             last += 1;
         }
         let n = (last - first + 1) as f64;
@@ -508,7 +515,7 @@ impl View {
         (variance <= MOST_VARIANCE).then_some(surface)
     }
 
-    /// Whether reading `i` and the one before it may be of one thing.
+    /// Returns whether reading `i` and the one before it may belong to one object.
     pub(super) fn is_connected(&self, i: usize) -> bool {
         let (one, two) = (&self.readings[i - 1], &self.readings[i]);
         let (p, q) = (self.points[i - 1], self.points[i]);
@@ -516,24 +523,24 @@ impl View {
         (p.0 - q.0).hypot(p.1 - q.1) <= CONNECTED_M + 3.0 * apart
     }
 
-    /// Beams that have a range.
+    /// Returns the beams that have a range.
     pub(super) fn readings(&self) -> &[Reading] {
         &self.readings[..self.count]
     }
 
-    /// Where they end, in the robot's frame.
+    /// Returns the points of the readings in the robot's frame.
     pub(super) fn points(&self) -> &[(f64, f64)] {
         &self.points[..self.count]
     }
 
-    /// Keeps for each reading how long what it shows is not trusted.
+    /// Stores for each reading for how long its object is ignored.
     pub(super) fn doubt(&mut self, doubts: &[u8]) {
         for (reading, doubt) in self.readings[..self.count].iter_mut().zip(doubts) {
             reading.doubt = *doubt;
         }
     }
 
-    /// Whether the beams to both sides of `point` end more than `margin` behind it: nothing was there.
+    /// Returns whether `point` is in empty space: the beams to both sides of it end more than `margin` after it.
     pub(super) fn sees_through(&self, point: (f64, f64), margin: f64) -> bool {
         let Some((distance, at)) = self.towards(point) else { return false };
         let last = self.grid.2 as f64 - 1.0;
@@ -541,15 +548,15 @@ impl View {
             return false;
         }
         let first = at as usize - 1;
-        // One more on each side: next to an edge, exact angles may be a step off.
+        // Check one more beam on each side, because exact angles may be a step off.
         (first..(first + 4).min(self.grid.2)).all(|beam| {
             let reading = self.readings().get(usize::from(self.slots[beam]));
             reading.is_some_and(|one| usize::from(one.beam) == beam && one.range > distance + margin)
         })
     }
 
-    /// How far `point` is from the sensor, and how many steps behind the first beam it lies, which may be less than none or
-    /// more than there are.
+    /// Returns the distance of `point` from the sensor, and its direction as a number of steps after the first beam. That number
+    /// may be negative, or greater than the number of beams.
     fn towards(&self, point: (f64, f64)) -> Option<(f64, f64)> {
         let (first, step, beams) = self.grid;
         let (x, y) = (point.0 - self.pose.x_m, point.1 - self.pose.y_m);
@@ -566,8 +573,8 @@ impl View {
         is_whole(self.grid.2, self.grid.1)
     }
 
-    /// The reading whose point is nearest to `point`, if it is nearer than `most`. Behind a beam that looks past `point` by an
-    /// angle there is nothing nearer than the sine of that angle says, so that few are looked at.
+    /// Returns the reading whose point is nearest to `point`, if it is nearer than `most`. The sine of the angle between a beam
+    /// and `point` is a lower bound of the distance for all beams farther aside, so only a few are compared.
     pub(super) fn nearest(&self, point: (f64, f64), most: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
@@ -577,7 +584,7 @@ impl View {
         let (turn, last) = (TAU / step.abs(), beams as f64 - 1.0);
         let begin = usize::from(self.slots[at.clamp(0.0, last) as usize]);
         let mut best = (most * most, None);
-        // The least distance from a beam so many steps aside, by sin a >= 2 a / pi; exact angles are up to a step off.
+        // Minimum distance of a beam that is `aside` steps away, by sin a >= 2 a / pi. Exact angles are up to a step off.
         let bound = |aside: f64| distance * ((aside - 1.5) * step.abs() / FRAC_PI_2).clamp(0.0, 1.0);
         let mut look = |i: usize, at: f64| {
             let aside = (f64::from(self.readings[i].beam) - at).abs();
@@ -607,52 +614,53 @@ impl View {
 }
 
 impl Surface {
-    /// How far `point` is before or behind it.
+    /// Returns the signed distance of `point` from the surface.
     #[inline]
     pub(super) fn off(&self, point: (f64, f64)) -> f64 {
         self.normal.0 * point.0 + self.normal.1 * point.1 - self.r
     }
 }
 
-/// Beams are first looked for so far from surfaces, then always half as far.
+/// Maximum distance of a beam from its surface in the first round. It is halved in each round.
 const FIRST_M: f64 = 0.3;
-/// At last they are off by less than so many deviations: Tukey's constant, by which next to nothing is lost where all is noise.
+/// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if there
+/// is only noise.
 const WIDTH: f64 = 3.0;
 const ROUNDS: usize = 20;
-/// So many beams are enough for all rounds but the last ones.
+/// Number of beams that are enough for all rounds except the last ones.
 const COARSE: usize = 120;
 const STILL_M: f64 = 2e-5;
 const STILL_RAD: f64 = 1e-5;
-/// Beams that say something of a direction, at least: fewer may be a leg.
+/// Minimum number of beams that define a direction. Fewer may be a leg.
 const LEAST_BEAMS: usize = 6;
-/// From so many on it is better than to guess.
+/// Number of beams from which on a direction is better than a guess.
 const SAID_BEAMS: f64 = 1.5;
-/// The same as a share of all beams: in a long corridor, frames of doors are taken for one another.
+/// `LEAST_BEAMS` as a share of all beams. In a long corridor, door frames are mistaken for one another.
 const LEAST_PART: f64 = 0.03;
 /// Maximum number of readings that are judged together. A whole wall would count as moving because of one end of it.
 const PIECE: usize = 24;
 /// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the others.
 const CAP: f64 = 9.0;
-/// How often what moves is looked for.
+/// Number of times that moving objects are searched for.
 const LOOKS: usize = 2;
-/// What does not move is off by at most so many times what its noise says, in the mean of squares.
+/// Maximum mean square of the readings of an object that stands, in variances of their noise.
 const MORE: f64 = 3.0;
-/// For so many kept scans what was seen to move is not trusted.
+/// Number of kept scans for which a moving object is ignored.
 const DOUBT: u8 = 3;
-/// Of the variance of a range.
+/// Minimum variance across a surface, as a share of the variance of a range.
 const LEAST_SHARE: f64 = 0.05;
-/// Twice what is to be expected: of a sum of many.
+/// Factor of the part of the weight that is expected by chance.
 const CHANCE: f64 = 2.0;
-/// Neighbouring beams end so far apart, where their surface still counts as that of a point between them.
+/// Maximum distance of neighboring points whose surface counts for a point between them.
 pub(super) const SPACING_M: f64 = 0.2;
-/// Corners and lines are the same within so many deviations, and this.
+/// Maximum distance of equal corners and lines in standard deviations, and in addition to that in meters.
 const NEAR: f64 = 3.0;
 const NEAR_M: f64 = 0.02;
-/// Ranges are never surer than this, in metres: what a scanner has beside its noise.
+/// Minimum standard deviation of a range in meters, for errors of a scanner other than noise.
 const LEAST_NOISE_M: f64 = 0.005;
-/// Neighbours on each side that a surface is laid through.
-const NEIGHBOURS: usize = 4;
-/// Points of one surface are nearer to each other than this, and what a flat view adds.
+/// Number of neighbors on each side that define a surface.
+const NEIGHBORS: usize = 4;
+/// Maximum distance of two points of one object, in addition to that of a surface that is seen at a flat angle.
 const CONNECTED_M: f64 = 0.1;
-/// A surface whose direction is less sure than to 10 degrees is none.
+/// Maximum variance of the direction of a surface: 10 degrees.
 const MOST_VARIANCE: f64 = 0.03;
