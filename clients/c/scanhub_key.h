@@ -148,9 +148,9 @@ static inline int scanhub_is_of(const struct scanhub_key *key, const void *bytes
     struct scanhub_sha sha = key->inner;
     uint8_t digest[32], differs = 0;
     unsigned i;
-    scanhub_sha_add(&sha, at, 44);
+    scanhub_sha_add(&sha, at, SCANHUB_DATAGRAM_AT_CRC);
     scanhub_sha_add(&sha, no_crc, 4);
-    scanhub_sha_add(&sha, at + 48, len - 16 - 48);
+    scanhub_sha_add(&sha, at + SCANHUB_DATAGRAM_AT_END, len - 16 - SCANHUB_DATAGRAM_AT_END);
     scanhub_sha_end(&sha, digest);
     sha = key->outer;
     scanhub_sha_add(&sha, digest, 32);

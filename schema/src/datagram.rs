@@ -6,6 +6,7 @@
 mod announce;
 mod payload;
 
+use bytemuck::{Pod, Zeroable, bytes_of};
 use crc::{CRC_32_ISCSI, Crc, Table};
 
 use crate::Topic;
@@ -15,7 +16,7 @@ pub use payload::{FixedPayload, Packed, UsedElements};
 pub(crate) use payload::{are_finite, packed_as_is, read_head, used_elements, write};
 
 /// Bytes of the header.
-pub const HEAD: usize = 48;
+pub const HEAD: usize = size_of::<DatagramHead>();
 /// Bytes of the MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
 pub const MAC: usize = 16;
 /// Longest datagram that is never fragmented where tunnels leave an MTU of 1400.
@@ -32,6 +33,47 @@ pub const PARTS: usize = 255;
 pub const PORT: u16 = 22_200;
 /// First three bytes of all groups. [`group`] returns the last one.
 pub const GROUPS: [u8; 3] = [239, 255, 76];
+
+/// Header of a datagram as it is sent. 48 bytes.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+struct DatagramHead {
+    /// Magic: `SHUB`.
+    magic: [u8; 4],
+    /// Version: 2.
+    version: u8,
+    /// Length of the header: 48. A later gateway may append fields; readers skip them.
+    header_len: u8,
+    /// Number of the topic. See the table of groups.
+    topic: u8,
+    /// Flags: [`LanFlags`]. Readers ignore other bits.
+    flags: u8,
+    /// Random number of the gateway, the same in all its runs.
+    hub: u64,
+    /// Number of the gateway's run, higher than in every earlier run.
+    epoch: u32,
+    /// Number of the sample among those of this sensor and topic, from 0 in each epoch. It wraps.
+    sequence: u32,
+    /// Wall clock of the telegram's first byte, in ns since 1970. For announcements and `status`, the time of sending.
+    stamp_ns: u64,
+    /// Position of the sensor's link in the hub's configuration, from 0.
+    sensor: u8,
+    /// Index of this part within the sample, from 0.
+    part: u8,
+    /// Number of parts of the sample, mostly 1.
+    parts: u8,
+    /// Family of the sensor: [`Family`](crate::Family); 255 while the hub searches for the scanner. Other numbers belong to
+    /// later versions, whose telegrams are just bytes.
+    family: u8,
+    /// Length in bytes of the payload, or of this part of it, without the MAC.
+    payload_len: u16,
+    /// Revision of the payload, from 1. A higher revision only appends fields.
+    revision: u16,
+    /// Lower half of the sample's `seq`, which the samples of one telegram share.
+    counter: u32,
+    /// CRC-32C of the datagram, computed with 0 in this field.
+    crc: u32,
+}
 
 /// Bits of [`Head::flags`].
 pub struct LanFlags;
@@ -137,18 +179,30 @@ impl Head {
 
     /// Writes the header to the start of `datagram`, with a checksum of 0.
     fn write(&self, datagram: &mut [u8], len: usize, flags: u8) -> Option<()> {
-        let (head, _) = datagram.split_first_chunk_mut::<HEAD>()?;
-        head[..4].copy_from_slice(MAGIC);
-        head[4..8].copy_from_slice(&[VERSION, HEAD as u8, self.topic, flags]);
-        head[8..16].copy_from_slice(&self.hub.to_le_bytes());
-        head[16..20].copy_from_slice(&self.epoch.to_le_bytes());
-        head[20..24].copy_from_slice(&self.sequence.to_le_bytes());
-        head[24..32].copy_from_slice(&self.stamp_ns.to_le_bytes());
-        head[32..36].copy_from_slice(&[self.sensor, self.part, self.parts, self.family]);
-        head[36..38].copy_from_slice(&u16::try_from(len).ok()?.to_le_bytes());
-        head[38..40].copy_from_slice(&self.revision.to_le_bytes());
-        head[40..44].copy_from_slice(&self.counter.to_le_bytes());
-        head[CRC_AT..].fill(0);
+        let &Head { topic, hub, epoch, sequence, stamp_ns, .. } = self;
+        let &Head { sensor, part, parts, family, revision, counter, .. } = self;
+        let (magic, version, header_len) = (MAGIC, VERSION, HEAD as u8);
+        let (payload_len, crc) = (u16::try_from(len).ok()?, 0);
+        let head = DatagramHead {
+            magic,
+            version,
+            header_len,
+            topic,
+            flags,
+            hub,
+            epoch,
+            sequence,
+            stamp_ns,
+            sensor,
+            part,
+            parts,
+            family,
+            payload_len,
+            revision,
+            counter,
+            crc,
+        };
+        datagram.get_mut(..HEAD)?.copy_from_slice(bytes_of(&head));
         Some(())
     }
 }
@@ -182,24 +236,21 @@ impl<'a> Datagram<'a> {
     ///
     /// Returns the reason of the first check that fails, in the order of [`DatagramError`].
     pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, DatagramError> {
-        let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(DatagramError::Short)?;
-        if &head[..4] != MAGIC {
+        let head: DatagramHead = read_head(bytes).ok_or(DatagramError::Short)?;
+        if head.magic != MAGIC {
             return Err(DatagramError::Magic);
         }
-        if head[4] != VERSION {
+        if head.version != VERSION {
             return Err(DatagramError::Version);
         }
-        let begin = usize::from(head[5]);
-        let (part, parts) = (head[33], head[34]);
+        let DatagramHead { topic, flags, hub, epoch, sequence, stamp_ns, .. } = head;
+        let DatagramHead { sensor, part, parts, family, revision, counter, .. } = head;
+        let begin = usize::from(head.header_len);
         if begin < HEAD || begin > bytes.len() || part >= parts {
             return Err(DatagramError::Header);
         }
-        let two = |at: usize| u16::from_le_bytes([head[at], head[at + 1]]);
-        let four = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| head[at + i]));
-        let eight = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| head[at + i]));
-        let flags = head[7];
-        let (payload, mac) =
-            bytes[begin..].split_at_checked(usize::from(two(36))).ok_or(DatagramError::Length)?;
+        let payload_len = usize::from(head.payload_len);
+        let (payload, mac) = bytes[begin..].split_at_checked(payload_len).ok_or(DatagramError::Length)?;
         if parts > 1 && payload.len() > PART_LONGEST {
             return Err(DatagramError::Length);
         }
@@ -212,22 +263,22 @@ impl<'a> Datagram<'a> {
         digest.update(&bytes[..CRC_AT]);
         digest.update(&[0; HEAD - CRC_AT]);
         digest.update(&bytes[HEAD..]);
-        if digest.finalize() != four(CRC_AT) {
+        if digest.finalize() != head.crc {
             return Err(DatagramError::Crc);
         }
         let head = Head {
-            topic: head[6],
+            topic,
             flags,
-            hub: eight(8),
-            epoch: four(16),
-            sequence: four(20),
-            stamp_ns: eight(24),
-            sensor: head[32],
+            hub,
+            epoch,
+            sequence,
+            stamp_ns,
+            sensor,
             part,
             parts,
-            family: head[35],
-            revision: two(38),
-            counter: four(40),
+            family,
+            revision,
+            counter,
         };
         Ok(Datagram { head, payload, mac })
     }
@@ -239,10 +290,10 @@ pub fn group(topic: Topic) -> u8 {
     topic.row().group
 }
 
-const MAGIC: &[u8; 4] = b"SHUB";
+const MAGIC: [u8; 4] = *b"SHUB";
 const VERSION: u8 = 2;
 /// Offset of the checksum, which is computed with these four bytes as 0.
-const CRC_AT: usize = 44;
+const CRC_AT: usize = std::mem::offset_of!(DatagramHead, crc);
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 
 // Payloads are sent as they are in memory.

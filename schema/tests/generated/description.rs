@@ -16,6 +16,8 @@ use super::rules;
 /// All layouts, those of fields and elements before those that contain them.
 pub(crate) struct Description {
     pub(crate) layouts: Vec<Layout>,
+    /// Layouts of the header of a datagram, and of an announcement with its topics.
+    pub(crate) datagram: Vec<Layout>,
     pub(crate) sets: BTreeMap<String, Set>,
 }
 
@@ -155,7 +157,8 @@ impl Description {
     pub(crate) fn read() -> Description {
         let mut sources = Sources::default();
         sources.read_folder(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"));
-        let mut description = Description { layouts: Vec::new(), sets: BTreeMap::new() };
+        let mut description =
+            Description { layouts: Vec::new(), datagram: Vec::new(), sets: BTreeMap::new() };
         description.add("Header", &sources);
         for topic in Topic::ALL {
             let Some(name) = topic.payload().strip_prefix("scanhub.") else { continue };
@@ -166,6 +169,11 @@ impl Description {
             let head = format!("{name}Head");
             description.add(if sources.structs.contains_key(&head) { &head } else { name }, &sources);
         }
+        let payloads = description.layouts.len();
+        for rust in ["DatagramHead", "AnnounceHead", "Announced"] {
+            description.add(rust, &sources);
+        }
+        description.datagram = description.layouts.split_off(payloads);
         description
     }
 

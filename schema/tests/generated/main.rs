@@ -22,6 +22,7 @@ mod python;
 mod readers;
 mod recording;
 mod rules;
+mod wire;
 
 use std::path::Path;
 use std::{env, fs};
@@ -116,8 +117,11 @@ fn c_is_up_to_date() {
     let description = Description::read();
     let blocks = [("structs", c::structs(&description)), ("checks", c::checks(&description))];
     check_blocks("clients/c/include/scanhub/attach.h", &blocks);
-    let payloads =
-        [("values", datagram_c::values(&description)), ("payloads", datagram_c::payloads(&description))];
+    let payloads = [
+        ("values", datagram_c::values(&description)),
+        ("wire", wire::c(&description)),
+        ("payloads", datagram_c::payloads(&description)),
+    ];
     check_blocks("clients/c/scanhub.h", &payloads);
     check_blocks("clients/c/include/scanhub/attach.hpp", &[("topics", c::topics(&description))]);
 }
@@ -131,7 +135,11 @@ fn pages_are_up_to_date() {
         layouts.map(|layout| (layout.name.as_str(), docs::tables(&description, layout))).collect();
     check_blocks("docs/topics.md", &tables);
     check_blocks("docs/topics.md", &[("services", docs::services())]);
-    let blocks = [("payloads", docs::payloads(&description)), ("groups", docs::groups())];
+    let blocks = [
+        ("header", wire::header(&description)),
+        ("payloads", docs::payloads(&description)),
+        ("groups", docs::groups()),
+    ];
     check_blocks("docs/datagram.md", &blocks);
 }
 
@@ -140,6 +148,7 @@ fn python_is_up_to_date() {
     let description = Description::read();
     let blocks = [
         ("constants", python::constants(&description)),
+        ("wire", wire::python(&description)),
         ("classes", python::classes(&description)),
         ("union", python::union(&description)),
         ("readers", python::functions(&description)),
@@ -152,6 +161,7 @@ fn lua_is_up_to_date() {
     let description = Description::read();
     let blocks = [
         ("values", lua::values(&description)),
+        ("wire", wire::lua(&description)),
         ("fields", lua::fields(&description)),
         ("payloads", lua::functions(&description)),
     ];

@@ -271,7 +271,7 @@ impl Values {
     }
 }
 
-fn code(kind: &str) -> char {
+pub(crate) fn code(kind: &str) -> char {
     match kind {
         "u8" => 'B',
         "u16" => 'H',
