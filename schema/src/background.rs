@@ -8,9 +8,8 @@ use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, cast_slice_mut, pod_read_una
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::BEAMS;
-use crate::datagram::{Packed, packed_as_is, read_head, write};
 use crate::limits::TopicLimits;
-use crate::sliced::sliced;
+use crate::payload::{Packed, packed_as_is, read_head, sliced, write};
 use crate::topic::PayloadLen;
 
 /// Head of a background model, before the ranges. 32 bytes.

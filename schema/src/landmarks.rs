@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{FixedPayload, UsedElements, are_finite, used_elements};
+use crate::payload::{FixedPayload, UsedElements, are_finite, used_elements};
 
 /// Maximum number of marks of a scan.
 pub const MARKS: usize = 64;

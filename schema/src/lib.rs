@@ -7,17 +7,15 @@ mod background;
 mod control;
 pub mod csv;
 pub mod datagram;
-mod failure;
+mod family;
 #[cfg(feature = "mcap")]
 pub mod file;
 mod header;
 mod landmarks;
 mod motion;
-mod pose;
+mod payload;
 mod scan;
-mod sliced;
 mod status;
-mod telegram;
 mod text;
 mod tilt;
 mod time;
@@ -32,22 +30,20 @@ mod saved;
 /// The payloads of all topics, with the types of their fields. The client library exports them too.
 pub mod payloads {
     pub use crate::background::*;
+    pub use crate::family::*;
     pub use crate::landmarks::*;
     pub use crate::motion::*;
     pub use crate::scan::*;
     pub use crate::status::*;
-    pub use crate::telegram::*;
     pub use crate::tilt::*;
     pub use crate::tracks::*;
     pub use crate::zones::*;
 }
 
 pub use control::{Request, Response, Shown, Verb};
-pub use failure::{Failure, Kind};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use payloads::*;
-pub use pose::Pose;
-pub use text::{Printable, escape_json, json_line};
+pub use text::{Failure, Kind, Printable, escape_json, json_line};
 pub use time::{Age, MICROS, MILLIS, MIN_RATE_SPAN, Nanos, line_time, rate_hz};
 pub use topic::{
     CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Maker, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake,

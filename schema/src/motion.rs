@@ -6,7 +6,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{FixedPayload, are_finite};
+use crate::payload::{FixedPayload, are_finite};
 
 /// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///

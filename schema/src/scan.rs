@@ -1,21 +1,16 @@
 //! One revolution of a scanner: ranges in device units with their codes, and optional arrays. Each scan contains the
 //! few numbers that are needed to read it, so that a reader needs to know neither protocol nor mode of the scanner.
 
-mod family;
-
 use std::fmt;
 
 use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{packed_as_is, read_head};
+use crate::family::{Family, lms_code};
 use crate::limits::TopicLimits;
-use crate::sliced::sliced;
+use crate::payload::{packed_as_is, read_head, sliced};
 use crate::topic::PayloadLen;
-
-pub use family::{Family, PacketFacts};
-pub(crate) use family::{REFLECTOR_MODE, has_reflector_bits};
 
 /// Maximum number of beams of a scan, in any family.
 pub const BEAMS: usize = 8192;
@@ -427,7 +422,7 @@ impl Code {
             return Code::NotMeasured;
         }
         if head.family == Family::Lms as u8 {
-            return family::lms_code(head, value);
+            return lms_code(head, value);
         }
         let all = [Code::NoReturn, Code::Beyond, Code::TooNear, Code::TooBright, Code::Weak, Code::Overflow];
         all.into_iter().find(|code| code.value() == value).unwrap_or(Code::Error)

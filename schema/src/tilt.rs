@@ -7,9 +7,10 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut, pod_read_unaligned};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{FixedPayload, UsedElements, are_finite, packed_as_is, read_head, used_elements};
 use crate::limits::TopicLimits;
-use crate::sliced::sliced;
+use crate::payload::{
+    FixedPayload, UsedElements, are_finite, packed_as_is, read_head, sliced, used_elements,
+};
 use crate::topic::PayloadLen;
 use crate::{BEAMS, Header};
 

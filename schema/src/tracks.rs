@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{FixedPayload, UsedElements, are_finite, used_elements};
+use crate::payload::{FixedPayload, UsedElements, are_finite, used_elements};
 use crate::{Pose, text};
 
 /// Maximum number of people in a sample.

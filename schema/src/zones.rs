@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::datagram::{FixedPayload, UsedElements, used_elements};
+use crate::payload::{FixedPayload, UsedElements, used_elements};
 
 /// Maximum number of zones of a sensor.
 pub const ZONES: usize = 8;

@@ -13,7 +13,7 @@ const MAY: [&str; 10] = [
     // The configuration that users start from, with a section for each.
     "hub/config/src/default.toml",
     // Number and name, in each language that reads scans, and what can be said of its packets.
-    "schema/src/scan/family.rs",
+    "schema/src/family.rs",
     "schema/src/file/layout.txt",
     "clients/c/include/scanhub/attach.h",
     "clients/c/scanhub.h",

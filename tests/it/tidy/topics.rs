@@ -66,7 +66,7 @@ fn a_topic_is_in_few_files() {
     holds(few_files_name_a_topic, |tree| {
         vec![
             tree.with("hub/daemon/src/topics.rs", "//! Topics.\nif topic == Topic::Motion {\n"),
-            tree.with("schema/src/datagram/payload.rs", "//! Payloads.\nimpl Packed for Motion {\n"),
+            tree.with("schema/src/payload.rs", "//! Payloads.\nimpl Packed for Motion {\n"),
             tree.with("clients/client/src/lib.rs", "//! Client.\npub use scanhub_schema::{Marks, Motion};\n"),
             tree.with("hub/daemon/src/link.rs", "//! A link.\ntopics.publishers.motion.prepare();\n"),
         ]
