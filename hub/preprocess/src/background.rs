@@ -233,8 +233,8 @@ impl Model {
         write(scan, self.generation, &self.classes[..count], out);
     }
 
-    /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at `pose` and
-    /// [`Method::Moving`]. If the motion restarts or is refused, the model forgets everything.
+    /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at
+    /// `pose` and [`Method::Moving`]. If the motion restarts or is refused, the model forgets everything.
     pub fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
         if let Learner::Moving(moving) = &mut self.learner
             && !moving.follow(pose, motion, velocity)
@@ -574,8 +574,8 @@ mod tests {
     }
 
     impl Reading {
-        /// Returns the reading of beam `i` of `scan`. No return is the most frequent code in real rooms. Each processor decides
-        /// whether it means [`Reading::Far`] or [`Reading::Invalid`].
+        /// Returns the reading of beam `i` of `scan`. No return is the most frequent code in real rooms. Each processor
+        /// decides whether it means [`Reading::Far`] or [`Reading::Invalid`].
         fn of(scan: &Scan, i: usize, no_return_is_far: bool) -> Reading {
             match (scan.distance_mm(i), scan.code(i)) {
                 (Some(range_mm), _) => Reading::Valid(range_mm),

@@ -33,7 +33,8 @@ impl Directions {
         self.grid.get(i).copied()
     }
 
-    /// Returns the readings of `scan` in the order of the beams, except those of 0: beam, direction, and range in meters.
+    /// Returns the readings of `scan` in the order of the beams, except those of 0: beam, direction, and range in
+    /// meters.
     pub(crate) fn readings<'a>(
         &'a self,
         pose: &'a Pose,

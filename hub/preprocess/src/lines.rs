@@ -1,12 +1,12 @@
-//! Finds the straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise along
-//! its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
+//! Finds the straight lines of one scan: those that make the measured ranges likeliest, if each range has normal noise
+//! along its beam. A beam belongs to one line or to none. No state is kept from one scan to the next.
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
-//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined to
-//! lines, the likeliest first, then the cuts between lines are moved (`pieces`).
+//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined
+//! to lines, the likeliest first, then the cuts between lines are moved (`pieces`).
 //!
-//! No parameter is set by hand: the noise is estimated from the scan, and a Bayesian information criterion decides whether a
-//! line explains more than noise.
+//! No parameter is set by hand: the noise is estimated from the scan, and a Bayesian information criterion decides
+//! whether a line explains more than noise.
 
 mod fit;
 mod pieces;
@@ -27,8 +27,8 @@ pub struct Settings {
     pub max: u8,
     /// Minimum number of beams of a line, at least 3.
     pub min_points: u16,
-    /// Whether to use the slower, better form: cuts are moved to where they help most, and beams at the ends of a line that fit
-    /// worst are dropped.
+    /// Whether to use the slower, better form: cuts are moved to where they help most, and beams at the ends of a line
+    /// that fit worst are dropped.
     pub polish: bool,
     /// Condition that ends the joining of lines.
     pub stop: Stop,
@@ -37,11 +37,11 @@ pub struct Settings {
 /// Condition that ends the joining of lines.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Stop {
-    /// One line less would explain the scan worse than its noise does. Points more than one meter apart are never joined. The
-    /// paper has this distance for real scans.
+    /// One line less would explain the scan worse than its noise does. Points more than one meter apart are never
+    /// joined. The paper has this distance for real scans.
     Likelihood,
-    /// At most `max` lines are left. Points farther apart than this number of meters are never joined. Used for comparisons at
-    /// equal numbers of lines.
+    /// At most `max` lines are left. Points farther apart than this number of meters are never joined. Used for
+    /// comparisons at equal numbers of lines.
     Number(f64),
 }
 
@@ -142,9 +142,9 @@ impl LineFinder {
         groups
     }
 
-    /// Returns the standard deviation of a range in meters, at least that of rounding to the unit of `scan`. It is computed from
-    /// the distances of each beam from the lines through its neighbors, and through the beams after these. Edges and corners do
-    /// not change their median.
+    /// Returns the standard deviation of a range in meters, at least that of rounding to the unit of `scan`. It is
+    /// computed from the distances of each beam from the lines through its neighbors, and through the beams after
+    /// these. Edges and corners do not change their median.
     fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
         let (mut count, mut first) = (0, 0);
         let steps = self.steps.as_flattened_mut();
@@ -166,8 +166,8 @@ impl LineFinder {
         let least = f64::from(scan.unit_um) * 1e-6 / 12_f64.sqrt();
         let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return least };
         let (_, median, _) = steps.select_nth_unstable_by(count / 2, f64::total_cmp);
-        // The median of the absolute value is .6745 deviations; that of one range and the mean of two others has the variance
-        // 1 + 1/2.
+        // The median of the absolute value is .6745 deviations; that of one range and the mean of two others has the
+        // variance 1 + 1/2.
         (*median / (0.6745 * 1.5_f64.sqrt())).max(least)
     }
 
@@ -194,13 +194,14 @@ impl LineFinder {
     }
 }
 
-/// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the criterion of
-/// Zhang and Siegmund (2007) for points of change.
+/// Number of parameters of a line: its two numbers, and the cut to the next line, which counts twice, as in the
+/// criterion of Zhang and Siegmund (2007) for points of change.
 const NUMBERS: f64 = 4.0;
 /// Maximum distance of neighboring points of one line in meters. PLE uses it for real scans.
 const GAP_M: f64 = 1.0;
-/// Error in meters that dropping a beam counts as, if there are more lines than allowed. On logs of four sensors (aces, Freiburg,
-/// Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC, and fit better.
+/// Error in meters that dropping a beam counts as, if there are more lines than allowed. On logs of four sensors (aces,
+/// Freiburg, Intel, Orebro: `cargo bench --bench perception`), ten vertices then cover more beams than those of RANSAC,
+/// and fit better.
 const LOSS_M: f64 = 0.2;
 /// Lines are neighbors if fewer beams than this are between them.
 const NEIGHBORS: f32 = 4.5;
@@ -250,8 +251,9 @@ fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> 
     is_known.then_some(line)
 }
 
-/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the directions of the last
-/// beam of the one and the first beam of the other. Both have the same range there, so that no object is between them.
+/// Writes the corners of neighboring lines that are certainly not parallel, and that meet between the directions of the
+/// last beam of the one and the first beam of the other. Both have the same range there, so that no object is between
+/// them.
 fn corners(out: &mut Lines, pose: &Pose, step: f32) {
     let count = usize::from(out.count);
     // In a full revolution, the last line is a neighbor of the first one.

@@ -143,8 +143,8 @@ impl Open {
     }
 
     fn mark(&self, scan: &Scan) -> Mark {
-        // In integers, so that halves are rounded the same way on every machine; so long that nothing overflows, whatever the
-        // scan says.
+        // In integers, so that halves are rounded the same way on every machine; so long that nothing overflows,
+        // whatever the scan says.
         let [first_udeg, step_udeg] =
             [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
         let weight = 1000 * i128::from(self.weight);
@@ -168,8 +168,8 @@ fn in_range_mdeg(mdeg: i128) -> i32 {
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Returns the difference of the exact angle of beam `i` from that of the beam, in millionths of a degree; 0 without an exact
-/// angle. The angles may differ by whole revolutions.
+/// Returns the difference of the exact angle of beam `i` from that of the beam, in millionths of a degree; 0 without an
+/// exact angle. The angles may differ by whole revolutions.
 fn off_udeg(scan: &Scan, i: usize) -> i64 {
     let Some(exact) = exact_angle(scan.exact_angles(), i) else { return 0 };
     let off = exact - (scan.first_angle + i as f64 * scan.step);

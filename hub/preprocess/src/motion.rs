@@ -125,8 +125,8 @@ impl MotionEstimator {
         self.velocity
     }
 
-    /// Writes the motion since the last scan into `out`, every byte of it. `stamp_ns` is the stamp of `scan`, and `period_ns` the
-    /// time from one scan to the next, 0 if it is unknown.
+    /// Writes the motion since the last scan into `out`, every byte of it. `stamp_ns` is the stamp of `scan`, and
+    /// `period_ns` the time from one scan to the next, 0 if it is unknown.
     pub fn update(&mut self, scan: &Scan, stamp_ns: u64, period_ns: u64, out: &mut Motion) {
         *out = Motion::default();
         let elapsed_ns = stamp_ns.saturating_sub(std::mem::replace(&mut self.stamp_ns, stamp_ns));
@@ -185,8 +185,8 @@ impl MotionEstimator {
         }
     }
 
-    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, until the velocity is that
-    /// of the step. Returns the position and the step, and by how much the beams may still be off.
+    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, until the
+    /// velocity is that of the step. Returns the position and the step, and by how much the beams may still be off.
     fn correct(
         &mut self,
         scan: &Scan,
@@ -203,7 +203,8 @@ impl MotionEstimator {
             let offset = change.offset(scan);
             let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
             if !change.is_possible() && !is_again {
-                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was right.
+                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was
+                // right.
                 self.rejected = Some(measured);
                 return (self.stop_or_continue(scan, track, found), offset);
             }
@@ -227,8 +228,9 @@ impl MotionEstimator {
         }
     }
 
-    /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as before, because
-    /// the `found` step is an error. The scan fits better with the right velocity. Returns the position and the step.
+    /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as
+    /// before, because the `found` step is an error. The scan fits better with the right velocity. Returns the position
+    /// and the step.
     fn stop_or_continue(&mut self, scan: &Scan, track: &Track, found: (Match, Rigid)) -> (Match, Rigid) {
         let moving = std::mem::take(&mut self.velocity);
         if !moving.distorts(scan, DISTORTED_M) {
@@ -255,7 +257,8 @@ impl MotionEstimator {
         self.now.take(&self.pose, scan, &self.lines);
     }
 
-    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that is known.
+    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that
+    /// is known.
     fn find(&mut self, track: &Track, begin: Option<Rigid>) -> Option<(Match, Rigid)> {
         let settings = self.settings;
         let begin = begin.unwrap_or_else(|| initial_guess(&self.kept, &self.now, track, &settings));
@@ -315,8 +318,8 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place
     }
 }
 
-/// Returns the covariance of the position that `step` leads to, in the frame of the kept scan. All positions in that frame are
-/// found independently of each other, so the covariances of the steps between them are not summed.
+/// Returns the covariance of the position that `step` leads to, in the frame of the kept scan. All positions in that
+/// frame are found independently of each other, so the covariances of the steps between them are not summed.
 fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) -> Square {
     let mut of_step = Square::default();
     add_doubts(&mut of_step, track, found, step, offset);
@@ -332,8 +335,8 @@ fn add_doubts(covariance: &mut Square, track: &Track, found: &Match, step: &Rigi
     covariance::add_outer(covariance, offset, 1.0);
 }
 
-/// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion after
-/// which the correction is repeated. A repeated correction adds the noise of the last step.
+/// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion
+/// after which the correction is repeated. A repeated correction adds the noise of the last step.
 const DISTORTED_M: f64 = 0.003;
 const CHANGED_M: f64 = 0.01;
 /// Maximum number of corrections after a change of velocity. Each one leaves less than half of the error.
@@ -347,8 +350,8 @@ const AWAY_RAD: f64 = 0.15;
 /// Minimum share of readings on surfaces of the kept scan. With less, another scan is kept.
 const ENOUGH: f64 = 0.5;
 
-/// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners and lines
-/// of the two scans that may be the same propose positions, and a few beams choose among them.
+/// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners
+/// and lines of the two scans that may be the same propose positions, and a few beams choose among them.
 fn initial_guess(kept: &View, now: &View, track: &Track, settings: &Settings) -> Rigid {
     let mut best =
         Guess { kept, now, track, settings, place: track.last.then(&track.step), score: 0, tries: 0 };

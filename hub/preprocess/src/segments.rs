@@ -1,5 +1,5 @@
-//! Groups neighboring foreground beams into segments, and computes the position of each segment and whether it is supported.
-//! A distant edge flickers in single beams. An object is seen by several beams, or for longer.
+//! Groups neighboring foreground beams into segments, and computes the position of each segment and whether it is
+//! supported. A distant edge flickers in single beams. An object is seen by several beams, or for longer.
 
 use std::f64::consts::{PI, TAU};
 use std::mem::{replace, take};
@@ -43,8 +43,8 @@ struct Step {
 const FLATTEST_DEG: f64 = 10.0;
 /// Additional distance for the noise of two ranges, in mm.
 const NOISE_MM: f64 = 15.0;
-/// Maximum distance of a point of the previous scan that supports a single beam, in mm. A person who runs at 3 m/s moves by
-/// this distance in one revolution of a scanner at 10 Hz.
+/// Maximum distance of a point of the previous scan that supports a single beam, in mm. A person who runs at 3 m/s
+/// moves by this distance in one revolution of a scanner at 10 Hz.
 const REACH_MM: f64 = 300.0;
 
 impl Segmenter {
@@ -58,11 +58,11 @@ impl Segmenter {
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
     ///
     /// Two foreground beams belong together if they are neighbours and their points lie as near to each other as those
-    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range, and the
-    /// step from one exact angle to the other where there are such.
+    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range,
+    /// and the step from one exact angle to the other where there are such.
     ///
-    /// A segment is supported if it has several beams, or if its point is at most 0.3 m from one of the foreground of the scan
-    /// before: of the last one that was given here.
+    /// A segment is supported if it has several beams, or if its point is at most 0.3 m from one of the foreground of
+    /// the scan before: of the last one that was given here.
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
@@ -104,7 +104,8 @@ impl Segmenter {
         self.room = replace(&mut self.before, now);
     }
 
-    /// Stores the points of a `foreground` that support the next segments, like [`update`](Self::update), but finds no segments.
+    /// Stores the points of a `foreground` that support the next segments, like [`update`](Self::update), but finds no
+    /// segments.
     pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.fit(scan);
         let mut now = take(&mut self.room);
@@ -115,8 +116,8 @@ impl Segmenter {
         self.room = replace(&mut self.before, now);
     }
 
-    /// Calls `visit` with each beam whose bit is set: its number, its range in device units, its range in mm with its exact angle if
-    /// it has one, and its point.
+    /// Calls `visit` with each beam whose bit is set: its number, its range in device units, its range in mm with its
+    /// exact angle if it has one, and its point.
     fn each_point(
         &self,
         scan: &Scan,
@@ -142,8 +143,8 @@ impl Segmenter {
         }
     }
 
-    /// Returns whether a point at `next_mm` on the next beam, with this `exact` angle, belongs to the same segment as the last point
-    /// of `open`.
+    /// Returns whether a point at `next_mm` on the next beam, with this `exact` angle, belongs to the same segment as
+    /// the last point of `open`.
     fn joins(&self, open: &Open, (next_mm, exact): (f64, Option<f64>)) -> bool {
         let range_mm = open.last_mm;
         let step = open.last_exact.zip(exact).map_or(self.step, |(last, next)| Step::of(next - last));

@@ -1,5 +1,5 @@
-//! Motion of a robot in the plane: its velocity, transforms between its positions, and scans without the distortion by its
-//! motion, because it measures each beam from another position.
+//! Motion of a robot in the plane: its velocity, transforms between its positions, and scans without the distortion by
+//! its motion, because it measures each beam from another position.
 
 use std::f64::consts::{PI, TAU};
 
@@ -17,7 +17,8 @@ pub struct Velocity {
 }
 
 impl Velocity {
-    /// Returns the constant velocity that leads to the position `x`, `y`, `yaw` within `seconds`, in meters and radians.
+    /// Returns the constant velocity that leads to the position `x`, `y`, `yaw` within `seconds`, in meters and
+    /// radians.
     pub fn of_step((x, y, yaw): (f64, f64, f64), seconds: f64) -> Velocity {
         // The step is the chord of an arc.
         let half = yaw / 2.0;
@@ -26,8 +27,8 @@ impl Velocity {
         Velocity { x: arc * (cos * x + sin * y), y: arc * (cos * y - sin * x), yaw: yaw / seconds }
     }
 
-    /// Returns the position after `seconds`, or before if they are negative, in the frame of the start: x and y in meters, yaw in
-    /// radians.
+    /// Returns the position after `seconds`, or before if they are negative, in the frame of the start: x and y in
+    /// meters, yaw in radians.
     #[inline]
     pub fn position(&self, seconds: f64) -> (f64, f64, f64) {
         let half = self.yaw * seconds / 2.0;
@@ -58,8 +59,8 @@ impl Velocity {
         (self.x, self.y, self.yaw) = (self.x + GAIN * x, self.y + GAIN * y, self.yaw + GAIN * yaw);
     }
 
-    /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of it in radians,
-    /// while `scan` is measured.
+    /// Returns whether a robot with this velocity moves by more than `limit_m`, or turns by more than a fifth of it in
+    /// radians, while `scan` is measured.
     pub(crate) fn distorts(&self, scan: &Scan, limit_m: f64) -> bool {
         let [first_s, last_s] = times(scan);
         let span_s = last_s - first_s;
@@ -71,15 +72,16 @@ impl Velocity {
         self.x.hypot(self.y) < MAX_CHANGE_M_S && self.yaw.abs() < MAX_CHANGE_RAD_S
     }
 
-    /// Returns how far the beams of `scan` are off on average if they are corrected by a velocity that differs by this one.
+    /// Returns how far the beams of `scan` are off on average if they are corrected by a velocity that differs by this
+    /// one.
     pub(crate) fn offset(&self, scan: &Scan) -> [f64; 3] {
         let [first_s, last_s] = times(scan);
         [self.x, self.y, self.yaw].map(|speed| speed * (first_s + last_s) / 2.0)
     }
 }
 
-/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform from the
-/// frame of a robot there into that frame.
+/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform
+/// from the frame of a robot there into that frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rigid {
     /// Ahead.
@@ -147,8 +149,8 @@ impl UndistortedScan {
         UndistortedScan { words: vec![ScanWord::default(); beams + Scan::words(0)].into(), beams }
     }
 
-    /// Computes `scan` without the distortion by a sensor that moves with `velocity`. Beams have exact angles. If two are measured in
-    /// the same direction, the nearer one remains.
+    /// Computes `scan` without the distortion by a sensor that moves with `velocity`. Beams have exact angles. If two
+    /// are measured in the same direction, the nearer one remains.
     pub(crate) fn compute(&mut self, scan: &Scan, velocity: &Velocity) -> &Scan {
         let count = scan.beams().min(self.beams);
         let [first_s, last_s] = times(scan);
@@ -188,7 +190,8 @@ impl UndistortedScan {
                 usize::try_from(beam).ok().filter(|beam| *beam < count)
             };
             let Some(mut beam) = beam_of(slot).filter(|_| range >= 1.0) else { continue };
-            // Revolutions that are measured one after the other may meet the same beams, and leave those next to them empty.
+            // Revolutions that are measured one after the other may meet the same beams, and leave those next to them
+            // empty.
             if arrays.ranges[beam] != NO_RETURN {
                 let other = (f64::from(arrays.angles[beam]) - first_angle) / scan.step;
                 let next = beam_of(if slot > other { slot.round() + 1.0 } else { slot.round() - 1.0 });

@@ -1,5 +1,5 @@
-//! Writes ROS messages to an MCAP file as rosbag2 does: profile `ros2`, each channel with the definition of its type and the
-//! quality of service that its publisher offers.
+//! Writes ROS messages to an MCAP file as rosbag2 does: profile `ros2`, each channel with the definition of its type
+//! and the quality of service that its publisher offers.
 
 use std::io::{self, Write};
 
@@ -88,8 +88,8 @@ impl Bag {
         writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
     }
 
-    /// Writes the poses of all known sensors if `pose` of `sensor` is new. Log time and stamp are `wall_ns` (since 1970), or just
-    /// after the previous message.
+    /// Writes the poses of all known sensors if `pose` of `sensor` is new. Log time and stamp are `wall_ns` (since
+    /// 1970), or just after the previous message.
     pub fn pose<W: Write>(
         &mut self,
         writer: &mut Writer<W>,

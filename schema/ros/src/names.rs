@@ -35,8 +35,8 @@ pub struct Names {
 }
 
 impl Names {
-    /// Creates names with `namespace` at the start of every topic, `prefix` after it in topics of sensors, and a frame for each
-    /// sensor in `frames`. The slash before the first name is optional.
+    /// Creates names with `namespace` at the start of every topic, `prefix` after it in topics of sensors, and a frame
+    /// for each sensor in `frames`. The slash before the first name is optional.
     ///
     /// # Errors
     ///
@@ -83,11 +83,11 @@ impl Names {
     }
 }
 
-/// Appends the `poses` of the sensors on the robot, by their frames, to `message` as `tf2_msgs/msg/TFMessage`, with the stamp
-/// `stamp_ns` (since 1970). Pass all of them, because a late joiner gets only the last message of the topic.
+/// Appends the `poses` of the sensors on the robot, by their frames, to `message` as `tf2_msgs/msg/TFMessage`, with the
+/// stamp `stamp_ns` (since 1970). Pass all of them, because a late joiner gets only the last message of the topic.
 ///
-/// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's z.
-/// The angles of its scans then run in the other direction.
+/// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's
+/// z. The angles of its scans then run in the other direction.
 pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String, Pose)]) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(poses.len() as u32);

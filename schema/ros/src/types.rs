@@ -10,8 +10,8 @@ use sha2::{Digest, Sha256};
 pub struct Type {
     /// Name, such as `sensor_msgs/msg/LaserScan`.
     pub name: &'static str,
-    /// Definition in the language `ros2msg`, as rosbag2 stores it: the fields, then the types that it contains, each after a
-    /// separator.
+    /// Definition in the language `ros2msg`, as rosbag2 stores it: the fields, then the types that it contains, each
+    /// after a separator.
     pub text: &'static str,
 }
 
@@ -24,8 +24,8 @@ impl Type {
     const LINE: &str =
         "================================================================================\nMSG: ";
 
-    /// Returns the type's hash: SHA-256 of its description in JSON (REP 2016, `rosidl`), such as `RIHS01_64c1..`, with 64 hex
-    /// digits after the version.
+    /// Returns the type's hash: SHA-256 of its description in JSON (REP 2016, `rosidl`), such as `RIHS01_64c1..`, with
+    /// 64 hex digits after the version.
     pub fn hash(&self) -> String {
         Sha256::digest(description(&Layout::of(self))).iter().fold(PREFIX.to_owned(), |mut hash, byte| {
             let _ = write!(hash, "{byte:02x}");
@@ -251,8 +251,8 @@ const SEQUENCE: u8 = 144;
 mod tests {
     use super::*;
 
-    /// Hashes that PyPI's `rosbags` 0.11.9 computes for Jazzy, and `zenoh-ros2-sdk` 0.1.8 from the same definitions. Other
-    /// published code has the same hashes, taken from ROS itself.
+    /// Hashes that PyPI's `rosbags` 0.11.9 computes for Jazzy, and `zenoh-ros2-sdk` 0.1.8 from the same definitions.
+    /// Other published code has the same hashes, taken from ROS itself.
     const GOLDEN: [(Type, &str); 7] = [
         (LASER_SCAN, "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"),
         (POINT_CLOUD, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),

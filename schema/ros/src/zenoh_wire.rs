@@ -1,9 +1,9 @@
-//! Wire format of ROS 2 over Zenoh (`rmw_zenoh`), as text and bytes: keys of messages, tokens of nodes and publishers, the
-//! quality of service, and attachments of messages. Its sources are docs/design.md, `liveliness_utils.cpp` and
+//! Wire format of ROS 2 over Zenoh (`rmw_zenoh`), as text and bytes: keys of messages, tokens of nodes and publishers,
+//! the quality of service, and attachments of messages. Its sources are docs/design.md, `liveliness_utils.cpp` and
 //! `attachment_helpers.cpp` of `rmw_zenoh`.
 //!
-//! The attachment is that of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. Before, it had names
-//! between the values.
+//! The attachment is that of rmw_zenoh from 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6 (Kilted, Rolling) on. Before, it had
+//! names between the values.
 
 use sha2::{Digest, Sha256};
 
@@ -71,8 +71,8 @@ impl Qos {
         }
     }
 
-    /// Returns the text in a token: reliability (2 best effort), durability (1 transient local), history and depth, deadline,
-    /// lifespan, liveliness. Defaults are left out.
+    /// Returns the text in a token: reliability (2 best effort), durability (1 transient local), history and depth,
+    /// deadline, lifespan, liveliness. Defaults are left out.
     pub fn text(self) -> String {
         match self {
             Qos::SensorData => "2::,5:,:,:,,".to_owned(),
@@ -139,8 +139,8 @@ impl Node {
         std::array::from_fn(|i| digest[i])
     }
 
-    /// Returns the key under which subscribers query the last message of a latched `publisher`. As a token, it announces that
-    /// they can. `AdvancedPublisher` of `zenoh-ext` does this for `rmw_zenoh`.
+    /// Returns the key under which subscribers query the last message of a latched `publisher`. As a token, it
+    /// announces that they can. `AdvancedPublisher` of `zenoh-ext` does this for `rmw_zenoh`.
     pub fn history_key(&self, publisher: &Publisher<'_>) -> String {
         format!("{}/@adv/pub/{}/{}/_", self.key(publisher), self.session, publisher.number)
     }
@@ -164,8 +164,8 @@ impl Type {
 /// Size of an attachment in bytes.
 pub const ATTACHMENT: usize = 33;
 
-/// Returns the attachment of message `number` (from 1) of the publisher with ID `gid`, sent at `sent_ns` since 1970: two 64-bit
-/// numbers, little-endian, the length of the ID, and the ID.
+/// Returns the attachment of message `number` (from 1) of the publisher with ID `gid`, sent at `sent_ns` since 1970:
+/// two 64-bit numbers, little-endian, the length of the ID, and the ID.
 pub fn attachment(number: i64, sent_ns: i64, gid: [u8; 16]) -> [u8; ATTACHMENT] {
     let mut bytes = [0; ATTACHMENT];
     bytes[..8].copy_from_slice(&number.to_le_bytes());

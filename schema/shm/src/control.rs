@@ -1,5 +1,5 @@
-//! The control service: requests of clients, responses of the hub, and two events, one that wakes the hub and one that wakes
-//! clients. The hub's crate handles requests.
+//! The control service: requests of clients, responses of the hub, and two events, one that wakes the hub and one that
+//! wakes clients. The hub's crate handles requests.
 
 use std::fmt::Debug;
 
@@ -49,8 +49,8 @@ impl ControlServer {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, or if another hub is its server, and [`Kind::Failed`] if
-    /// the service has another layout.
+    /// Returns [`Kind::Short`] if memory or descriptors are short, or if another hub is its server, and
+    /// [`Kind::Failed`] if the service has another layout.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(CONTROL)?;
         let control = create(node, &service, || {

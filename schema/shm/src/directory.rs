@@ -1,11 +1,11 @@
 //! Private directories of this user: the directory of a domain, and the state directory, which survives restarts. Both
 //! contain small files and locks.
 //!
-//! A directory is opened component by component from the root of the file system, and every file in it relative to the open
-//! directory. No other user can put another directory in its place. The last components (base and domain) must belong to
-//! this user and be writable by no other user, and a link is never followed there. Above them, a link is followed if root or
-//! this user made it in a directory that no other user can write to: `/home` or `/var/run` may be links. The owners of the
-//! directories above the base are not checked.
+//! A directory is opened component by component from the root of the file system, and every file in it relative to the
+//! open directory. No other user can put another directory in its place. The last components (base and domain) must
+//! belong to this user and be writable by no other user, and a link is never followed there. Above them, a link is
+//! followed if root or this user made it in a directory that no other user can write to: `/home` or `/var/run` may be
+//! links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -48,8 +48,8 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can be
-    /// written to by others, or is reached by a link that another user could have made. Returns [`Kind::Short`] if
+    /// Returns [`Kind::Failed`] with the path, its owner and the remedy if base or domain belongs to another user, can
+    /// be written to by others, or is reached by a link that another user could have made. Returns [`Kind::Short`] if
     /// descriptors run out.
     pub fn open(root: &Path) -> Result<Option<Directory>, Failure> {
         Directory::walk(root, 2, Purpose::Domain, user(), false)
@@ -78,8 +78,8 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`], and does not open the file, if it is a link, is not a regular file, or belongs to another
-    /// user.
+    /// Returns [`Kind::Failed`], and does not open the file, if it is a link, is not a regular file, or belongs to
+    /// another user.
     pub fn file(&self, name: &str) -> Result<Option<File>, Failure> {
         match self.open_file(name, OFlags::RDONLY) {
             Err(Errno::NOENT) => Ok(None),
@@ -97,8 +97,8 @@ impl Directory {
         self.checked(name, opened)
     }
 
-    /// Replaces the content of the file `name` in one step: a reader, or the next process after a crash, finds the old or
-    /// the new content. Waits for the disk.
+    /// Replaces the content of the file `name` in one step: a reader, or the next process after a crash, finds the old
+    /// or the new content. Waits for the disk.
     ///
     /// # Errors
     ///
@@ -292,8 +292,8 @@ impl Purpose {
 
 const SET_STATE: &str = "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user";
 
-/// A lock on a file of a domain's directory. It ends with its process. The file has the ID of the process, because the kernel
-/// does not report it.
+/// A lock on a file of a domain's directory. It ends with its process. The file has the ID of the process, because the
+/// kernel does not report it.
 #[derive(Debug)]
 pub(crate) struct FileLock {
     file: File,
@@ -412,8 +412,8 @@ pub struct StateDirectory {
 }
 
 impl StateDirectory {
-    /// Returns the directory above those of all domains, which the environment of this process names: the one that systemd
-    /// created for the service, otherwise the user's own. `None` if the environment names no directory.
+    /// Returns the directory above those of all domains, which the environment of this process names: the one that
+    /// systemd created for the service, otherwise the user's own. `None` if the environment names no directory.
     pub fn base() -> Option<PathBuf> {
         base_in(|name| std::env::var_os(name))
     }
@@ -437,8 +437,8 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the one above it, belongs to another user, can be
-    /// written to by others, or is reached by a link that another user could have made.
+    /// Returns [`Kind::Failed`] with owner and remedy if the directory, or the one above it, belongs to another user,
+    /// can be written to by others, or is reached by a link that another user could have made.
     pub fn check(&self) -> Result<(), Failure> {
         self.open().map(drop)
     }
@@ -447,8 +447,8 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`check`](Self::check). Returns [`Kind::Failed`] if the file cannot be read, is not a regular file
-    /// of this user that no other user can write, has more than `most` bytes, or is not UTF-8.
+    /// Returns the errors of [`check`](Self::check). Returns [`Kind::Failed`] if the file cannot be read, is not a
+    /// regular file of this user that no other user can write, has more than `most` bytes, or is not UTF-8.
     pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
         let Some(directory) = self.open()? else { return Ok(None) };
         let Some(file) = directory.file(name)? else { return Ok(None) };
@@ -458,19 +458,19 @@ impl StateDirectory {
         })
     }
 
-    /// Replaces the content of the file `name`, which gets mode 0600. Creates the directory with mode 0700 if it does not
-    /// exist. Waits for the disk, so do not call it in a thread that reads a line.
+    /// Replaces the content of the file `name`, which gets mode 0600. Creates the directory with mode 0700 if it does
+    /// not exist. Waits for the disk, so do not call it in a thread that reads a line.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. It then keeps its
-    /// content.
+    /// Returns the errors of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be written. It then keeps
+    /// its content.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
         self.make()?.replace(name, text.as_bytes()).map_err(unkept)
     }
 
-    /// Waits for the lock that a process holds between reading and writing the file `name`, and returns it. The lock ends when
-    /// it is dropped. Creates the directory as [`write`](Self::write) does, and a file for the lock.
+    /// Waits for the lock that a process holds between reading and writing the file `name`, and returns it. The lock
+    /// ends when it is dropped. Creates the directory as [`write`](Self::write) does, and a file for the lock.
     ///
     /// # Errors
     ///

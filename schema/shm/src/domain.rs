@@ -1,8 +1,8 @@
 //! Domains: the locations in which the shared memory of a hub may be, and the hubs that run on this machine.
 //!
-//! [`Domain`] and [`Environment`] only compute locations, in the order in which clients search them. [`RunningHub`] finds
-//! the hubs of all users, as /proc shows them. Shared memory is for one user, so a client of another user finds no hub.
-//! Its message then names the user whose hub runs, and the command that reaches it.
+//! [`Domain`] and [`Environment`] only compute locations, in the order in which clients search them. [`RunningHub`]
+//! finds the hubs of all users, as /proc shows them. Shared memory is for one user, so a client of another user finds
+//! no hub. Its message then names the user whose hub runs, and the command that reaches it.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
@@ -14,8 +14,8 @@ use scanhub_schema::{Failure, Kind};
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
 
-/// Root and prefix, with its random part, must have fewer bytes than this. The path of a listener's socket has at most 107
-/// bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
+/// Root and prefix, with its random part, must have fewer bytes than this. The path of a listener's socket has at most
+/// 107 bytes (unix(7)), and contains a number of up to 35 digits and 7 other bytes.
 const PLACE_LIMIT: usize = 66;
 
 /// Bytes that are added to the prefix (`segments.rs`): five random letters, and `_`.
@@ -68,8 +68,9 @@ impl Domain {
         Domain::at(name, &base)
     }
 
-    /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if it is given,
-    /// otherwise in each directory that a hub may have chosen. Locations that are too long for a hub are left out.
+    /// Returns the locations in which a client searches for domain `name`, in this order: only below `base` if it is
+    /// given, otherwise in each directory that a hub may have chosen. Locations that are too long for a hub are left
+    /// out.
     ///
     /// # Errors
     ///
@@ -136,8 +137,8 @@ impl Environment {
         }
     }
 
-    /// Returns every directory that may contain domains, in the order in which clients search. It contains the directory of
-    /// the login session even without XDG_RUNTIME_DIR, which sudo, ssh and cron do not set.
+    /// Returns every directory that may contain domains, in the order in which clients search. It contains the
+    /// directory of the login session even without XDG_RUNTIME_DIR, which sudo, ssh and cron do not set.
     pub fn bases(&self) -> Vec<PathBuf> {
         let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
         bases.push(SERVICE_BASE.into());
@@ -180,8 +181,8 @@ pub struct RunningHub {
 }
 
 impl RunningHub {
-    /// Returns the hubs on the machine whose files are below `root`, by process ID. Processes that this user may not see
-    /// are missing.
+    /// Returns the hubs on the machine whose files are below `root`, by process ID. Processes that this user may not
+    /// see are missing.
     pub fn all(root: &Path) -> Vec<RunningHub> {
         let users = fs::read_to_string(root.join("etc/passwd")).unwrap_or_default();
         let processes = fs::read_dir(root.join("proc")).into_iter().flatten().flatten();
@@ -247,8 +248,8 @@ impl RunningHub {
         format!("{whose} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
     }
 
-    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one that
-    /// the caller has asked for. If the hub's domain is unknown, the command lists the domains of the hub's user.
+    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one
+    /// that the caller has asked for. If the hub's domain is unknown, the command lists the domains of the hub's user.
     pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         // sudo resets the environment of the command.
         let (sudo, environment, domain) = if self.uid == caller.uid {

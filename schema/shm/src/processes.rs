@@ -1,8 +1,9 @@
-//! Processes of a domain: their membership, the locks of those that publish, and the cleanup after those that have died.
+//! Processes of a domain: their membership, the locks of those that publish, and the cleanup after those that have
+//! died.
 //!
 //! - Each process joins with a [`Node`]. The last one to leave removes the domain's names.
-//! - At most one hub, at most one listener for remote sensors, and one process for each name of a sensor, tracker or mount
-//!   hold a lock. A lock ends with its process. Subscribers query the locks but never take one.
+//! - At most one hub, at most one listener for remote sensors, and one process for each name of a sensor, tracker or
+//!   mount hold a lock. A lock ends with its process. Subscribers query the locks but never take one.
 //! - A cleanup does not touch files in shared memory that did not belong to a known dead process.
 
 use std::fs::{self, File};
@@ -213,8 +214,8 @@ struct Publishing {
 }
 
 impl Publishing {
-    /// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's file.
-    /// `held` returns the failure if another process has the lock.
+    /// Takes the lock `name`, chooses a prefix if the domain has none, and writes this process's ID into the lock's
+    /// file. `held` returns the failure if another process has the lock.
     fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<Publishing, Failure> {
         let lock = FileLock::acquire(root, name, held)?;
         // A reader that finds a process ID relies on the prefix.
@@ -308,8 +309,8 @@ pub struct Cleaned {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by itself.
-/// Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
+/// Returns [`Kind::DomainHeld`](scanhub_schema::Kind) if a hub or a listener publishes there, because it cleans up by
+/// itself. Returns [`Kind::Failed`](scanhub_schema::Kind) if the directory belongs to another user.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();
     let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };

@@ -1,9 +1,9 @@
-//! Files in shared memory, which lie in one directory for all users of the machine. Their names start with the prefix of
-//! their domain:
+//! Files in shared memory, which lie in one directory for all users of the machine. Their names start with the prefix
+//! of their domain:
 //!
-//! - The prefix is `sh_DOMAIN_WORD_`. WORD is random: without it, another user could occupy the names before the hub starts.
-//!   The prefix is stored in the file `prefix` of the domain's directory, which only this user can read. It stays as long as
-//!   any process uses it.
+//! - The prefix is `sh_DOMAIN_WORD_`. WORD is random: without it, another user could occupy the names before the hub
+//!   starts. The prefix is stored in the file `prefix` of the domain's directory, which only this user can read. It
+//!   stays as long as any process uses it.
 //! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because
 //!   the library only reports "internal error".
 //! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it

@@ -1,4 +1,5 @@
-//! Creates, opens and lists services. Failures are classified by the remedy: wait, retry later, or report it to the user.
+//! Creates, opens and lists services. Failures are classified by the remedy: wait, retry later, or report it to the
+//! user.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -174,8 +175,8 @@ fn sensors_with(domain: &Domain, is_wanted: impl Fn(Topic) -> bool) -> Result<Ve
     Ok(sensors)
 }
 
-/// Returns all topics in `domain` with their sensors, sorted by sensor. Those of a dead hub stay as long as a subscriber
-/// keeps them.
+/// Returns all topics in `domain` with their sensors, sorted by sensor. Those of a dead hub stay as long as a
+/// subscriber keeps them.
 ///
 /// # Errors
 ///

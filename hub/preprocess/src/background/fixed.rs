@@ -1,14 +1,14 @@
-//! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one range per
-//! beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
+//! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one
+//! range per beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`] were
-//! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
+//! [`Multi`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, Runs};
 use scanhub_schema::Background;
 
-/// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of times in a
-/// row. A beam that flips between two surfaces never learns either of them.
+/// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of
+/// times in a row. A beam that flips between two surfaces never learns either of them.
 #[derive(Clone)]
 pub(super) struct Paper {
     /// Ranges in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
@@ -78,8 +78,8 @@ impl Paper {
     }
 }
 
-/// State of the method with several surfaces per beam. At edges, a beam flips between two surfaces, and both are learned.
-/// [`Runs`] decides how many neighboring beams make an object.
+/// State of the method with several surfaces per beam. At edges, a beam flips between two surfaces, and both are
+/// learned. [`Runs`] decides how many neighboring beams make an object.
 #[derive(Clone)]
 pub(super) struct Multi {
     slots: [Slots; SLOTS],
@@ -150,8 +150,8 @@ impl Multi {
         }
     }
 
-    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there is
-    /// none.
+    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
+    /// is none.
     fn compare(&mut self, readings: &[u16], bounds: Bounds, classes: &mut [Class]) {
         let n = readings.len();
         // All slices have one length, so the loop needs no bounds checks.

@@ -1,6 +1,6 @@
-//! A background for a scanner that moves: a map of the objects around the robot that stand, which scrolls with it. A beam that
-//! ends in space that was seen free is in the foreground. Shadows, and the edge of the space that was seen, are unknown. The
-//! robot's position comes with each scan.
+//! A background for a scanner that moves: a map of the objects around the robot that stand, which scrolls with it. A
+//! beam that ends in space that was seen free is in the foreground. Shadows, and the edge of the space that was seen,
+//! are unknown. The robot's position comes with each scan.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -35,7 +35,8 @@ struct Cell {
     hits: u16,
     /// Number of scans that saw through it, less an eighth of those in which a beam ended here.
     free: u16,
-    /// Number of times that a beam ended here after others had seen through. Chair legs are thinner than the distance of two beams.
+    /// Number of times that a beam ended here after others had seen through. Chair legs are thinner than the distance
+    /// of two beams.
     returns: u8,
     /// Number of consecutive scans that saw through it.
     through: u8,
@@ -88,8 +89,8 @@ impl Moving {
         self.runs.forget();
     }
 
-    /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at `pose`.
-    /// Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
+    /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at
+    /// `pose`. Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
     pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
         let robot = Rigid::new(motion.x_m, motion.y_m, motion.yaw_rad);
         let (x, y) = robot.point((pose.x_m, pose.y_m));
@@ -190,7 +191,8 @@ impl Moving {
         is_near(x, self.middle.0) && is_near(y, self.middle.1)
     }
 
-    /// Adds the scan to the map. Each cell counts once, and a beam that ended in a cell outweighs those that saw through it.
+    /// Adds the scan to the map. Each cell counts once, and a beam that ended in a cell outweighs those that saw
+    /// through it.
     fn lay(&mut self, beams: usize, limits: &Limits) {
         self.scan = if self.scan >= Mark::SCANS { 1 } else { self.scan + 1 };
         if self.scan == 1 {
@@ -275,7 +277,8 @@ impl Moving {
 }
 
 impl Cell {
-    /// Returns whether an object stands in the cell. It must have stood there before the cell was seen free, or for long enough.
+    /// Returns whether an object stands in the cell. It must have stood there before the cell was seen free, or for
+    /// long enough.
     fn stands(&self, limits: &Limits) -> bool {
         self.hits >= STANDS && self.free < FREE
             || self.hits >= limits.scans.max(STANDS)
@@ -334,8 +337,8 @@ const AROUND: i32 = 2;
 const FREE: u16 = 5;
 /// Number of beams that must end in a cell that was never seen free, until an object stands there.
 const STANDS: u16 = 3;
-/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that see through it after which
-/// it does not.
+/// Number of returns from which on a thin object stands in a cell, and number of consecutive scans that see through it
+/// after which it does not.
 const RETURNS: u8 = 24;
 const LONG: u8 = 60;
 /// Number of cells before the end of a beam that do not count as seen free.

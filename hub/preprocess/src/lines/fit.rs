@@ -2,10 +2,10 @@
 //!
 //! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
 //! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
-//! their beams, so the likeliest line has the minimum sum of squares of (measured range - range of the line). That difference
-//! is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same up to the factor
-//! measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead from its line to the
-//! likeliest one ([`Line::refined`]).
+//! their beams, so the likeliest line has the minimum sum of squares of (measured range - range of the line). That
+//! difference is not linear in a and b. The expression range^2 (a cos + b sin) - range is linear, and is the same up to
+//! the factor measured / true range. Its sums are updated beam by beam ([`Sums`]). A few Gauss-Newton steps lead from
+//! its line to the likeliest one ([`Line::refined`]).
 
 /// A beam that has a range: its direction as a unit vector, and its range in meters.
 #[derive(Clone, Copy, Debug, Default)]
@@ -34,7 +34,8 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// Returns the inverse of the range at which `ray` meets the line. It is not positive if the ray does not meet the line.
+    /// Returns the inverse of the range at which `ray` meets the line. It is not positive if the ray does not meet the
+    /// line.
     pub(super) fn inverse(&self, ray: &Ray) -> f64 {
         self.a * ray.cos + self.b * ray.sin
     }
@@ -126,7 +127,8 @@ impl Information {
         Some(sums)
     }
 
-    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; `None` if all rays have one direction.
+    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; `None` if all rays have one
+    /// direction.
     pub(super) fn inverse(&self, variance: f64) -> Option<(f64, f64, f64)> {
         let (product, det) = (self.aa * self.bb, self.aa * self.bb - self.ab * self.ab);
         let scale = variance / det;

@@ -1,5 +1,5 @@
-//! Matches a scan with another one: each of its beams ends on the surface nearest to it, and the position where the beams are
-//! least off is that of the scan.
+//! Matches a scan with another one: each of its beams ends on the surface nearest to it, and the position where the
+//! beams are least off is that of the scan.
 //!
 //! A [`View`] is one scan as it is compared: its points, the surfaces on which they lie, and its lines.
 
@@ -20,7 +20,8 @@ pub(super) struct Match {
     pub(super) of_kept: Square,
     /// Share of the readings that lie on surfaces.
     pub(super) overlap: f64,
-    /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits better.
+    /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits
+    /// better.
     pub(super) weight: f64,
     /// Whether a direction of the position is not known.
     pub(super) is_degenerate: bool,
@@ -32,7 +33,8 @@ pub(super) struct Match {
 
 /// Matches scans.
 pub(super) struct Matcher {
-    /// By reading: 0 for an object that stands, otherwise the number of kept scans for which a moving object is ignored.
+    /// By reading: 0 for an object that stands, otherwise the number of kept scans for which a moving object is
+    /// ignored.
     doubts: Box<[u8]>,
     runs: Box<[Run]>,
 }
@@ -57,8 +59,8 @@ struct Run {
 /// Sums over beams near surfaces.
 #[derive(Default)]
 struct Sums {
-    /// Sum of the weights times v v', where v is (nx, ny, n x p / scale): the number of beams that meet walls across each
-    /// direction.
+    /// Sum of the weights times v v', where v is (nx, ny, n x p / scale): the number of beams that meet walls across
+    /// each direction.
     weight: Square,
     slope: [f64; 3],
     /// Part of `weight` that surfaces of uncertain direction add by chance.
@@ -88,8 +90,8 @@ impl Matcher {
         Matcher { doubts: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
-    /// Returns the position of `now` relative to `kept`, near `begin`; `None` if too few beams match. In directions that the
-    /// surroundings do not define, the position is that of `begin`, with a standard deviation of `unknown_m`.
+    /// Returns the position of `now` relative to `kept`, near `begin`; `None` if too few beams match. In directions
+    /// that the surroundings do not define, the position is that of `begin`, with a standard deviation of `unknown_m`.
     pub(super) fn find(&mut self, kept: &View, now: &View, begin: Rigid, unknown_m: f64) -> Option<Match> {
         self.trust_all();
         let pair = Pair { kept, now, scale: scale(now)?, finest: WIDTH * kept.noise.hypot(now.noise) };
@@ -121,8 +123,8 @@ impl Matcher {
         (is_finite && place.x.is_finite() && place.y.is_finite() && place.yaw.is_finite()).then_some(found)
     }
 
-    /// Returns, by reading of the last scan, 0 for an object that stands, otherwise the number of kept scans for which a moving
-    /// object is ignored.
+    /// Returns, by reading of the last scan, 0 for an object that stands, otherwise the number of kept scans for which
+    /// a moving object is ignored.
     pub(super) fn doubts(&self) -> &[u8] {
         &self.doubts
     }
@@ -132,8 +134,8 @@ impl Matcher {
         self.doubts.fill(0);
     }
 
-    /// Marks readings of moving objects, and returns whether other readings than before are marked. A run of neighboring readings
-    /// is marked if one of these is true:
+    /// Marks readings of moving objects, and returns whether other readings than before are marked. A run of
+    /// neighboring readings is marked if one of these is true:
     ///
     /// - Together, they are farther from surfaces than their noise.
     /// - Most of them lie in space that was empty before.
@@ -261,8 +263,8 @@ impl Pair<'_> {
         })
     }
 
-    /// Returns the sums over every `stride`th beam at `place` that is less than `width` away from a surface and not on a moving
-    /// object.
+    /// Returns the sums over every `stride`th beam at `place` that is less than `width` away from a surface and not on
+    /// a moving object.
     fn sums(&self, place: &Rigid, width: f64, stride: usize, doubts: &[u8]) -> Sums {
         let mut sums = Sums::default();
         for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| doubts[i] == 0) {
@@ -288,8 +290,8 @@ impl Pair<'_> {
     }
 }
 
-/// Returns the root mean square distance of the points of `now`, so that a turn by its inverse moves them by about one meter.
-/// `None` if there are no points.
+/// Returns the root mean square distance of the points of `now`, so that a turn by its inverse moves them by about one
+/// meter. `None` if there are no points.
 fn scale(now: &View) -> Option<f64> {
     let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
     let scale = (square / now.points().len().max(1) as f64).sqrt();
@@ -318,7 +320,8 @@ impl Known {
         step
     }
 
-    /// Returns the covariance of the position by the noise of the scan, and by that of the kept one, in meters and radians.
+    /// Returns the covariance of the position by the noise of the scan, and by that of the kept one, in meters and
+    /// radians.
     fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
         // If beams are off by more than their noise, the position is less certain.
         let factor = (sums.off / sums.expected).max(1.0);
@@ -555,8 +558,8 @@ impl View {
         })
     }
 
-    /// Returns the distance of `point` from the sensor, and its direction as a number of steps after the first beam. That number
-    /// may be negative, or greater than the number of beams.
+    /// Returns the distance of `point` from the sensor, and its direction as a number of steps after the first beam.
+    /// That number may be negative, or greater than the number of beams.
     fn towards(&self, point: (f64, f64)) -> Option<(f64, f64)> {
         let (first, step, beams) = self.grid;
         let (x, y) = (point.0 - self.pose.x_m, point.1 - self.pose.y_m);
@@ -573,8 +576,9 @@ impl View {
         is_whole(self.grid.2, self.grid.1)
     }
 
-    /// Returns the reading whose point is nearest to `point`, if it is nearer than `most`. The sine of the angle between a beam
-    /// and `point` is a lower bound of the distance for all beams farther aside, so only a few are compared.
+    /// Returns the reading whose point is nearest to `point`, if it is nearer than `most`. The sine of the angle
+    /// between a beam and `point` is a lower bound of the distance for all beams farther aside, so only a few are
+    /// compared.
     pub(super) fn nearest(&self, point: (f64, f64), most: f64) -> Option<usize> {
         let (_, step, beams) = self.grid;
         if self.count == 0 {
@@ -584,7 +588,8 @@ impl View {
         let (turn, last) = (TAU / step.abs(), beams as f64 - 1.0);
         let begin = usize::from(self.slots[at.clamp(0.0, last) as usize]);
         let mut best = (most * most, None);
-        // Minimum distance of a beam that is `aside` steps away, by sin a >= 2 a / pi. Exact angles are up to a step off.
+        // Minimum distance of a beam that is `aside` steps away, by sin a >= 2 a / pi. Exact angles are up to a step
+        // off.
         let bound = |aside: f64| distance * ((aside - 1.5) * step.abs() / FRAC_PI_2).clamp(0.0, 1.0);
         let mut look = |i: usize, at: f64| {
             let aside = (f64::from(self.readings[i].beam) - at).abs();
@@ -623,8 +628,8 @@ impl Surface {
 
 /// Maximum distance of a beam from its surface in the first round. It is halved in each round.
 const FIRST_M: f64 = 0.3;
-/// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if there
-/// is only noise.
+/// Maximum distance in the last rounds, in standard deviations. With this constant of Tukey, almost nothing is lost if
+/// there is only noise.
 const WIDTH: f64 = 3.0;
 const ROUNDS: usize = 20;
 /// Number of beams that are enough for all rounds except the last ones.
@@ -639,7 +644,8 @@ const SAID_BEAMS: f64 = 1.5;
 const LEAST_PART: f64 = 0.03;
 /// Maximum number of readings that are judged together. A whole wall would count as moving because of one end of it.
 const PIECE: usize = 24;
-/// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the others.
+/// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the
+/// others.
 const CAP: f64 = 9.0;
 /// Number of times that moving objects are searched for.
 const LOOKS: usize = 2;
