@@ -2,8 +2,7 @@
 
 use std::fmt;
 
-use crate::line::family::Probe;
-use crate::line::family::{Features, Model};
+use crate::line::family::{Features, Model, Probe};
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
@@ -35,20 +34,9 @@ macro_rules! families {
             match family { $(Family::$Family => &$family::FEATURES,)* }
         }
 
-        /// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine
-        /// them. They have the same number of beams, at most the maximum.
-        pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
-            match family { $(Family::$Family => $family::scan_heads(settings),)* }
-        }
-
         /// Creates a recognizer for each family. The search listens, and sends its requests, in this order.
         pub(crate) fn probes() -> Vec<Box<dyn Probe>> {
             vec![$(Box::<$family::Probe>::default()),*]
-        }
-
-        /// Returns the settings that `request` has for a scanner of `family`.
-        pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Settings, Refusal> {
-            match family { $(Family::$Family => $family::check(request),)* }
         }
 
         impl Session {
@@ -91,6 +79,26 @@ families! {
     Ld ld,
     Lms lms,
     Rplidar rplidar,
+}
+
+/// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine them. They have
+/// the same number of beams, at most the maximum. A revolution has as many beams as there is space for.
+pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
+    match family {
+        Family::Lms => lms::scan_heads(settings),
+        Family::Ld | Family::Rplidar => {
+            let beams = settings.beams.or(settings.max_beams).unwrap_or(features(family).auto.beams);
+            vec![ScanHead::turning(family, beams)]
+        }
+    }
+}
+
+/// Returns the settings that `request` has for a scanner of `family`.
+pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Settings, Refusal> {
+    match family {
+        Family::Lms => lms::check(request),
+        Family::Ld | Family::Rplidar => request.check_models(family, features(family)),
+    }
 }
 
 /// Creates the inquiry of a scanner of `family`, on a port that is open at `rate`, in bits per second. Without a rate, the

@@ -7,47 +7,57 @@ mod point_count;
 mod sequence;
 mod session;
 
-use scanhub_schema::{Family, MILLIS, Nanos};
+use scanhub_schema::{Contents, Family, MILLIS, Nanos};
 
 use crate::ld::packet::{Framer, LEN, Packet};
 use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{Approach, Evidence, Listen};
+use crate::line::family::{self, Approach, Evidence, Features, Listen, named, table};
+use crate::line::framing::fill;
 use crate::settings::Settings;
 
 pub use crate::line::{Tally, TurnCounts};
-pub use session::{FEATURES, Session, Trouble};
-pub(crate) use session::{check, scan_heads};
+pub use session::{Session, Trouble};
 
-/// A scanner of the family.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Model {
-    /// LD06.
-    Ld06,
-    /// LD19, also sold in the kit D500.
-    Ld19,
-    /// STL19P.
-    Stl19p,
-    /// STL27L.
-    Stl27l,
-    /// LD14P, whose head turns slower.
-    Ld14p,
+/// Models and settings of the family.
+pub const FEATURES: Features = Features {
+    models: &MODELS,
+    // Enough for all models but the STL27L.
+    auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
+    modes: &[],
+    keys: &[],
+    can_rest: false,
+    speaks_unasked: true,
+    has_whole_telegrams: false,
+    has_inquiry: false,
+    contents: Contents::TURNING,
+    max_telegram: session::MOST * LEN,
+};
+
+/// Describes a model for the configuration.
+const fn described(model: Model) -> family::Model {
+    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
+}
+
+/// All models, described for the configuration.
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
+
+named! {
+    /// A scanner of the family.
+    Model {
+        /// LD06.
+        Ld06 "ld06",
+        /// LD19, also sold in the kit D500.
+        Ld19 "ld19",
+        /// STL19P.
+        Stl19p "stl19p",
+        /// STL27L.
+        Stl27l "stl27l",
+        /// LD14P, whose head turns slower.
+        Ld14p "ld14p",
+    }
 }
 
 impl Model {
-    /// All of them.
-    pub const ALL: [Model; 5] = [Model::Ld06, Model::Ld19, Model::Stl19p, Model::Stl27l, Model::Ld14p];
-
-    /// Its name in configuration and words.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Model::Ld06 => "ld06",
-            Model::Ld19 => "ld19",
-            Model::Stl19p => "stl19p",
-            Model::Stl27l => "stl27l",
-            Model::Ld14p => "ld14p",
-        }
-    }
-
     /// The model of this name.
     pub fn named(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
@@ -142,21 +152,18 @@ impl crate::line::family::Probe for Probe {
 
     fn receive(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
-            let spare = self.framer.spare();
-            let len = spare.len().min(bytes.len());
-            spare[..len].copy_from_slice(&bytes[..len]);
-            self.framer.commit(len);
-            bytes = &bytes[len..];
+            let len = fill(self.framer.buffer.spare(), &mut bytes);
+            self.framer.buffer.commit(len);
             self.count();
         }
     }
 
     fn hold(&self) -> Option<Nanos> {
-        self.framer.hold()
+        self.framer.buffer.hold()
     }
 
     fn release(&mut self, idle: Nanos) {
-        self.framer.release(idle);
+        self.framer.buffer.release(idle);
         self.count();
     }
 

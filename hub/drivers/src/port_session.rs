@@ -93,12 +93,19 @@ impl PortSession {
         }
     }
 
+    /// Returns the session with the scanner. `None` while it is searched for.
+    fn session(&self) -> Option<&Session> {
+        if let Stage::Found(session) = &self.stage { Some(session) } else { None }
+    }
+
+    /// Does the same as [`session`](Self::session), to change it.
+    fn session_mut(&mut self) -> Option<&mut Session> {
+        if let Stage::Found(session) = &mut self.stage { Some(session) } else { None }
+    }
+
     /// Returns the family. `None` while it is searched for.
     pub fn family(&self) -> Option<Family> {
-        match &self.stage {
-            Stage::Searching(_) => None,
-            Stage::Found(session) => Some(session.family()),
-        }
+        self.session().map(Session::family)
     }
 
     /// Returns the models and settings of the family. `None` while it is searched for.
@@ -367,10 +374,7 @@ impl line::Session for PortSession {
     }
 
     fn end(&mut self, now: Nanos) -> bool {
-        match &mut self.stage {
-            Stage::Searching(_) => false,
-            Stage::Found(session) => session.end(now),
-        }
+        self.session_mut().is_some_and(|session| session.end(now))
     }
 
     fn restore_identity(&mut self, identity: Identity) {
@@ -413,10 +417,7 @@ impl line::Session for PortSession {
         is_readable: bool,
         status: Option<&mut Status>,
     ) -> Option<Received<'a>> {
-        match &mut self.stage {
-            Stage::Searching(_) => None,
-            Stage::Found(session) => session.read_recorded(telegram, is_readable, status),
-        }
+        self.session_mut()?.read_recorded(telegram, is_readable, status)
     }
 
     found! {

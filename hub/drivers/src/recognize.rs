@@ -2,6 +2,7 @@
 
 use scanhub_schema::{Family, MILLIS, Nanos};
 
+use crate::line::framing::fill;
 use crate::line::{Event, Output, Protocol as _, Session as _};
 use crate::lms::framer::{Framer, VETO_HOLD};
 use crate::{Session, Settings, features};
@@ -100,15 +101,6 @@ fn in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
             session.handle_timeout(IDLE);
         }
     }
-}
-
-/// Moves the first of `bytes` into `spare`, and returns their number.
-fn fill(spare: &mut [u8], bytes: &mut &[u8]) -> usize {
-    let len = spare.len().min(bytes.len());
-    let (now, later) = bytes.split_at(len);
-    spare[..len].copy_from_slice(now);
-    *bytes = later;
-    len
 }
 
 /// Time after which a session no longer holds packets back.

@@ -10,38 +10,65 @@ mod sequence;
 mod session;
 mod stream;
 
-use scanhub_schema::{Family, MILLIS};
+use scanhub_schema::{Contents, Family, MILLIS};
 
-use crate::line::family::{Approach, Asks, Evidence, Stop};
+use crate::line::family::{self, Approach, Asks, Evidence, Features, Stop, named, table};
+use crate::line::framing::fill;
 use crate::rplidar::framer::{Expect, Found, Framer};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Head};
-use crate::settings::Settings;
+use crate::settings::{Key, Settings};
 
 pub use crate::line::{Tally, TurnCounts};
 pub use request::{Health, Info};
-pub use session::{FEATURES, Session, Trouble};
-pub(crate) use session::{check, scan_heads};
+pub use session::{Session, Trouble};
 
-/// A scanner of the family.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Model {
-    /// A1M8.
-    A1,
-    /// A2M8, and the older ones of its kind.
-    A2m8,
-    /// A2M12.
-    A2m12,
-    /// A3M1.
-    A3,
-    /// S1.
-    S1,
-    /// S2.
-    S2,
-    /// S3.
-    S3,
-    /// C1.
-    C1,
+/// Models and settings of the family.
+pub const FEATURES: Features = Features {
+    models: &MODELS,
+    // Enough for all models but the S2 and the S3.
+    auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
+    modes: &MODES,
+    keys: &[Key::ModeName, Key::Idle],
+    can_rest: true,
+    speaks_unasked: false,
+    has_whole_telegrams: false,
+    has_inquiry: false,
+    contents: Contents::TURNING,
+    max_telegram: stream::MAX_SAMPLE_LEN,
+};
+
+/// Describes a model for the configuration.
+const fn described(model: Model) -> family::Model {
+    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
+}
+
+/// All models, described for the configuration.
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
+
+/// Names of all modes.
+const MODES: [&str; Mode::ALL.len()] = table!(Mode::ALL, Mode::name);
+
+named! {
+    /// A scanner of the family.
+    Model {
+        /// A1M8.
+        A1 "a1",
+        /// A2M8, and the older ones of its kind.
+        A2m8 "a2m8",
+        /// A2M12.
+        A2m12 "a2m12",
+        /// A3M1.
+        A3 "a3",
+        /// S1.
+        S1 "s1",
+        /// S2.
+        S2 "s2",
+        /// S3.
+        S3 "s3",
+        /// C1.
+        C1 "c1",
+    }
 }
 
 /// What turns the head.
@@ -56,24 +83,6 @@ pub(crate) enum Motor {
 }
 
 impl Model {
-    /// All of them.
-    pub const ALL: [Model; 8] =
-        [Model::A1, Model::A2m8, Model::A2m12, Model::A3, Model::S1, Model::S2, Model::S3, Model::C1];
-
-    /// Its name in configuration and words.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Model::A1 => "a1",
-            Model::A2m8 => "a2m8",
-            Model::A2m12 => "a2m12",
-            Model::A3 => "a3",
-            Model::S1 => "s1",
-            Model::S2 => "s2",
-            Model::S3 => "s3",
-            Model::C1 => "c1",
-        }
-    }
-
     /// The model of this name.
     pub fn named(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
@@ -165,50 +174,27 @@ impl Model {
 /// Share by which a number of beams may differ from that of the model's fastest mode, and still counts as the same.
 const CLOSE: f64 = 0.03;
 
-/// A way of measuring that a model may offer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mode {
-    /// A packet for each point, with its quality; the slowest.
-    Standard,
-    /// More points in packets with a checksum.
-    Express,
-    /// More points, for short distances.
-    Boost,
-    /// More points, for dark targets.
-    Sensitivity,
-    /// Fewer points, where the sun shines.
-    Stability,
-    /// The fastest of the S series and of the C1.
-    DenseBoost,
-    /// The fastest with a quality for each point.
-    UltraDense,
+named! {
+    /// A way of measuring that a model may offer.
+    Mode {
+        /// A packet for each point, with its quality; the slowest.
+        Standard "standard",
+        /// More points in packets with a checksum.
+        Express "express",
+        /// More points, for short distances.
+        Boost "boost",
+        /// More points, for dark targets.
+        Sensitivity "sensitivity",
+        /// Fewer points, where the sun shines.
+        Stability "stability",
+        /// The fastest of the S series and of the C1.
+        DenseBoost "denseboost",
+        /// The fastest with a quality for each point.
+        UltraDense "ultradense",
+    }
 }
 
 impl Mode {
-    /// All of them.
-    pub const ALL: [Mode; 7] = [
-        Mode::Standard,
-        Mode::Express,
-        Mode::Boost,
-        Mode::Sensitivity,
-        Mode::Stability,
-        Mode::DenseBoost,
-        Mode::UltraDense,
-    ];
-
-    /// Its name in configuration and words.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Mode::Standard => "standard",
-            Mode::Express => "express",
-            Mode::Boost => "boost",
-            Mode::Sensitivity => "sensitivity",
-            Mode::Stability => "stability",
-            Mode::DenseBoost => "denseboost",
-            Mode::UltraDense => "ultradense",
-        }
-    }
-
     /// The mode of this name.
     pub fn named(name: &str) -> Option<Mode> {
         Mode::said(name.as_bytes())
@@ -262,11 +248,8 @@ impl crate::line::family::Probe for Probe {
 
     fn receive(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
-            let spare = self.framer.spare();
-            let len = spare.len().min(bytes.len());
-            spare[..len].copy_from_slice(&bytes[..len]);
-            self.framer.commit(len);
-            bytes = &bytes[len..];
+            let len = fill(self.framer.buffer.spare(), &mut bytes);
+            self.framer.buffer.commit(len);
             while let Some(found) = self.framer.advance(1) {
                 match found {
                     Found::Reply(Answer::Info, span) => {
@@ -284,7 +267,7 @@ impl crate::line::family::Probe for Probe {
         match self.info {
             Some(info) => Evidence::Found(info.model().map(|model| model.name())),
             None if self.is_stream => Evidence::Stream,
-            None if self.is_asked && self.framer.buffered() > 0 => Evidence::Begun,
+            None if self.is_asked && !self.framer.buffer.open().is_empty() => Evidence::Begun,
             None => Evidence::None,
         }
     }

@@ -259,7 +259,7 @@ mod tests {
 
     #[test]
     fn lock_of_another_process_names_it() {
-        let (_other, port) = crate::tty::tests::pty();
+        let (_other, port) = crate::tests::pty();
         let mut owner = std::process::Command::new("flock");
         let owner = owner.arg(&port).args(["sh", "-c", "echo locked; exec cat"]);
         let owner = owner.stdin(std::process::Stdio::piped()).stdout(std::process::Stdio::piped()).spawn();

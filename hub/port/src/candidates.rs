@@ -421,7 +421,7 @@ const CHIPS: [(&str, &str, &str, &str); 25] = [
 ];
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname};
     use std::os::unix::fs::symlink;

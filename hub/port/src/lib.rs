@@ -155,10 +155,7 @@ impl Port {
 
     /// Returns whether another program simulates the sensor.
     pub fn simulated(&self) -> bool {
-        match self {
-            Port::Tty(tty) => tty.is_simulated(),
-            Port::Tcp(_) => false,
-        }
+        self.tty().is_some_and(Tty::is_simulated)
     }
 
     /// Starts to open `source` if that takes time. `None` if [`Port::attempt`] returns at once.
@@ -167,6 +164,11 @@ impl Port {
             Source::Tcp { host, port } => Some(Dial::start(host, *port)),
             _ => None,
         }
+    }
+
+    /// Returns the serial line. `None` for a serial server, whose line is at the other end of the network.
+    fn tty(&self) -> Option<&Tty> {
+        if let Port::Tty(tty) = self { Some(tty) } else { None }
     }
 
     /// Changes the rate, and discards the bytes that arrived at the old one. An error of kind `Unsupported` means that
@@ -183,10 +185,7 @@ impl Port {
 
     /// Asserts or clears DTR. A port without this line ignores it.
     pub fn set_dtr(&self, on: bool) -> io::Result<()> {
-        match self {
-            Port::Tty(tty) => tty.set_dtr(on),
-            Port::Tcp(_) => Ok(()),
-        }
+        self.tty().map_or(Ok(()), |tty| tty.set_dtr(on))
     }
 
     /// Does the same as [`Port::set_baud`], for callers that can try other rates. Returns the error if this rate is not
@@ -208,10 +207,7 @@ impl Port {
 
     /// Returns the number of bytes in the tty's input buffer, or `None` for a network port.
     pub fn waiting(&self) -> Option<usize> {
-        match self {
-            Port::Tty(tty) => tty.waiting(),
-            Port::Tcp(_) => None,
-        }
+        self.tty()?.waiting()
     }
 
     /// Returns the read budget of a network port. `None` for a tty, which is never throttled.
@@ -241,18 +237,12 @@ impl Port {
     /// Returns the errors that the driver counted on the line since the last call. Returns 0, without a system call, if
     /// it counts none.
     pub fn line_errors(&self) -> u64 {
-        match self {
-            Port::Tty(tty) => tty.line_errors(),
-            Port::Tcp(_) => 0,
-        }
+        self.tty().map_or(0, Tty::line_errors)
     }
 
     /// Returns the driver's counters since it was loaded, if it has any.
     pub fn counts(&self) -> Option<Counts> {
-        match self {
-            Port::Tty(tty) => tty.counts(),
-            Port::Tcp(_) => None,
-        }
+        self.tty()?.counts()
     }
 
     /// Returns the settings that another process has changed. `None` if they are unchanged, or if the settings are made
@@ -262,10 +252,7 @@ impl Port {
     ///
     /// Returns an error if the line is lost.
     pub fn altered(&self) -> io::Result<Option<Alteration>> {
-        match self {
-            Port::Tty(tty) => tty.altered(),
-            Port::Tcp(_) => Ok(None),
-        }
+        self.tty().map_or(Ok(None), Tty::altered)
     }
 
     /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
@@ -275,26 +262,17 @@ impl Port {
     ///
     /// Returns an error if the line is lost.
     pub fn restore(&self, baud: u32) -> io::Result<()> {
-        match self {
-            Port::Tty(tty) => tty.restore(baud),
-            Port::Tcp(_) => Ok(()),
-        }
+        self.tty().map_or(Ok(()), |tty| tty.restore(baud))
     }
 
     /// Returns the device that the port's name resolved to when it was opened; `None` for a serial server.
     pub fn device(&self) -> Option<&Path> {
-        match self {
-            Port::Tty(tty) => Some(tty.device()),
-            Port::Tcp(_) => None,
-        }
+        self.tty().map(Tty::device)
     }
 
     /// Returns the rate that the driver reports; `None` if the rate is set elsewhere.
     pub fn baud(&self) -> Option<u32> {
-        match self {
-            Port::Tty(tty) => tty.baud(),
-            Port::Tcp(_) => None,
-        }
+        self.tty()?.baud()
     }
 }
 
@@ -326,6 +304,15 @@ mod tests {
     use scanhub_schema::Kind;
     use std::io::Read as _;
     use std::os::unix::net::UnixStream;
+
+    /// Creates a pty; returns its master and the path of its slave.
+    pub(crate) fn pty() -> (OwnedFd, PathBuf) {
+        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pty");
+        grantpt(&master).and_then(|()| unlockpt(&master)).expect("a slave");
+        let name = ptsname(&master, Vec::new()).expect("a name").into_string().expect("ASCII");
+        (master, name.into())
+    }
 
     #[test]
     fn a_full_line_gets_the_beginning_of_what_is_written() {

@@ -467,23 +467,15 @@ impl LineErrors {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
+    use crate::tests::pty;
 
     #[test]
     fn rates_that_are_near_enough() {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
         // Rates that drivers set instead of 500 kBd if they do not support it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
-    }
-
-    /// Creates a pty; returns its master and the path of its slave.
-    pub(crate) fn pty() -> (OwnedFd, PathBuf) {
-        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
-        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pty");
-        grantpt(&master).and_then(|()| unlockpt(&master)).expect("a slave");
-        let name = ptsname(&master, Vec::new()).expect("a name").into_string().expect("ASCII");
-        (master, name.into())
     }
 
     #[test]

@@ -4,9 +4,8 @@
 
 use scanhub_schema::{MILLIS, Nanos};
 
-use crate::line::Point;
-use crate::line::framing::{Verdict, judge};
-use crate::line::{self, Buffer, Tally, suspect};
+use crate::line::framing::Verdict;
+use crate::line::{self, Buffer, Point, suspect};
 
 /// Bytes of a packet.
 pub const LEN: usize = 47;
@@ -174,15 +173,17 @@ pub struct Span {
 }
 
 /// The framer with its buffer.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Framer {
-    buffer: Buffer<CAPACITY>,
-    /// A packet waits for a header inside it.
-    is_held: bool,
-    /// It shall not any more.
-    is_released: bool,
-    /// Bytes were discarded since the last packet.
+    pub(crate) buffer: Buffer<CAPACITY>,
+    /// Whether bytes were discarded since the last packet.
     damage: bool,
+}
+
+impl Default for Framer {
+    fn default() -> Self {
+        Framer { buffer: Buffer::new(HOLD), damage: false }
+    }
 }
 
 struct Format;
@@ -205,33 +206,21 @@ impl line::framing::Format for Format {
 }
 
 impl Framer {
-    /// Room for the next bytes, never empty after [`Framer::advance`] answered `None`: write into its beginning, then
-    /// [`Framer::commit`].
-    pub fn spare(&mut self) -> &mut [u8] {
-        self.buffer.spare()
-    }
-
-    /// The first `len` bytes of [`Framer::spare`] are valid now.
-    pub fn commit(&mut self, len: usize) {
-        self.buffer.commit(len);
-        self.is_released &= len == 0;
-    }
-
     /// The next packets, `most` at most; `None` until more bytes come.
     pub fn advance(&mut self, most: usize) -> Option<Span> {
-        self.is_held = false;
+        self.buffer.begin_check();
         loop {
-            match self.judge(0) {
+            match self.buffer.judge(&Format, 0) {
                 Verdict::Packet => break,
                 Verdict::Open | Verdict::Held => return None,
                 Verdict::Nothing(rejected) => self.discard(rejected),
             }
         }
         let mut packets = 1;
-        while packets < most && matches!(self.judge(packets * LEN), Verdict::Packet) {
+        while packets < most && matches!(self.buffer.judge(&Format, packets * LEN), Verdict::Packet) {
             packets += 1;
         }
-        let is_damaged = core::mem::take(&mut self.damage) && self.tally().packets > 0;
+        let is_damaged = core::mem::take(&mut self.damage) && self.buffer.tally().packets > 0;
         let offset = self.buffer.offset();
         let at = self.buffer.take(packets * LEN, packets);
         Some(Span { at, packets, offset, reasons: if is_damaged { suspect::NEIGHBOUR } else { 0 } })
@@ -242,36 +231,10 @@ impl Framer {
         self.buffer.taken(span.at, span.packets * LEN)
     }
 
-    /// How long the line must be idle until [`Framer::release`] may let the packet pass that waits; `None` if none does.
-    pub fn hold(&self) -> Option<Nanos> {
-        self.is_held.then_some(HOLD)
-    }
-
-    /// A read found nothing, and no byte came for `idle`: gives up waiting for headers inside a packet.
-    pub fn release(&mut self, idle: Nanos) {
-        self.is_released |= self.is_held && idle >= HOLD;
-    }
-
     /// Gives up all bytes that are still open, for example because the line's rate changes.
     pub fn clear(&mut self) {
         self.buffer.clear();
-        (self.is_held, self.is_released, self.damage) = (false, false, false);
-    }
-
-    /// What became of the bytes.
-    pub fn tally(&self) -> &Tally {
-        self.buffer.tally()
-    }
-
-    /// Bytes whose fate is open.
-    pub fn buffered(&self) -> usize {
-        self.buffer.open().len()
-    }
-
-    fn judge(&mut self, at: usize) -> Verdict<Reject> {
-        let verdict = judge(&Format, &self.buffer.open()[at..], self.is_released);
-        self.is_held |= verdict == Verdict::Held;
-        verdict
+        self.damage = false;
     }
 
     /// Gives up the first open byte and all behind it up to the next that a packet may begin with.

@@ -228,7 +228,7 @@ pub(crate) struct Restarts {
     last: Option<(u16, Nanos)>,
     /// Whether the sequence that has just begun does not fit the one before it. Its second packet confirms it.
     is_suspected: bool,
-    count: u64,
+    pub(crate) count: u64,
 }
 
 impl Restarts {
@@ -246,11 +246,6 @@ impl Restarts {
     pub(crate) fn note_next(&mut self, millis: u16, at: Nanos) {
         self.count += u64::from(core::mem::take(&mut self.is_suspected));
         self.last = Some((millis, at));
-    }
-
-    /// Returns the number of restarts.
-    pub(crate) fn count(&self) -> u64 {
-        self.count
     }
 }
 
@@ -406,18 +401,18 @@ mod tests {
         let mut restarts = Restarts::default();
         restarts.note_first(100, Some((0, 0)));
         restarts.note_next(20_000, SECOND);
-        assert_eq!(restarts.count(), 0, "first contact");
+        assert_eq!(restarts.count, 0, "first contact");
         let arrival = Some((2 * SECOND, 2 * SECOND));
         restarts.note_first(500, arrival);
-        assert_eq!(restarts.count(), 0);
+        assert_eq!(restarts.count, 0);
         restarts.note_first(21_000, arrival);
         restarts.note_next(21_003, 2 * SECOND);
-        assert_eq!(restarts.count(), 0, "the one before was a chance match");
+        assert_eq!(restarts.count, 0, "the one before was a chance match");
         restarts.note_first(500, None);
         restarts.note_next(503, 4 * SECOND);
-        assert_eq!(restarts.count(), 0, "when it arrived is not known");
+        assert_eq!(restarts.count, 0, "when it arrived is not known");
         restarts.note_first(300, Some((5 * SECOND, 5 * SECOND)));
         restarts.note_next(303, 5 * SECOND);
-        assert_eq!(restarts.count(), 1);
+        assert_eq!(restarts.count, 1);
     }
 }

@@ -4,20 +4,17 @@
 
 use core::fmt;
 
-use scanhub_schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
+use scanhub_schema::{Family, MILLIS, Nanos, line_time};
 
-use crate::ld::Model;
-use crate::ld::packet::{Framer, Span};
-use crate::ld::packet::{LEN, POINTS, Packet};
+use crate::ld::packet::{Framer, LEN, POINTS, Packet, Span};
 use crate::ld::point_count::{Counted, PointCount};
-use crate::ld::sequence::Restarts;
-use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Features, table};
+use crate::ld::sequence::{Place, Restarts, Sequence};
+use crate::ld::{FEATURES, Model, described};
 use crate::line::{
     self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
-    StreamCounters, Tally, TurnCounts, Turns, Watchdog,
+    StreamCounters, Tally, TurnCounts, Turns, Watchdog, family,
 };
-use crate::settings::{Refusal, Settings, SettingsRequest};
+use crate::settings::Settings;
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
@@ -171,11 +168,6 @@ impl Session {
         self.sequence.points_per_second().map(Model::of_point_rate)
     }
 
-    /// Returns the number of beams of a scan, once the model is known.
-    pub fn beams(&self) -> Option<usize> {
-        self.beams
-    }
-
     /// Returns the points that the scanner measures per second, once enough packets have arrived.
     pub fn points_per_second(&self) -> Option<f32> {
         self.sequence.points_per_second()
@@ -183,7 +175,7 @@ impl Session {
 
     /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
-        self.framer.tally()
+        self.framer.buffer.tally()
     }
 
     /// Returns the numbers of revolutions by kind.
@@ -235,7 +227,7 @@ impl Session {
                 self.listen(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(self.now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.tally());
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.tally());
                 self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
             }
             _ => {}
@@ -295,7 +287,7 @@ impl Session {
         // A packet that arrived twice is stamped by its arrival, and the next one by the scanner's clock.
         let last = self.reads.date_packet(last.max(at));
         self.current = Some(Current { span, places, packet: 0, is_put: false });
-        self.counters.note_packets(self.framer.tally(), span.packets);
+        self.counters.note_packets(self.framer.buffer.tally(), span.packets);
         self.continue_stream();
         Received {
             bytes: self.framer.bytes(span),
@@ -323,7 +315,7 @@ impl Session {
         match &mut self.phase {
             Phase::Streaming(watchdog) => {
                 watchdog.note_packets(self.now);
-                self.counters.continue_stream(self.framer.tally());
+                self.counters.continue_stream(self.framer.buffer.tally());
                 if self.measured.is_none()
                     && self.now >= self.undecided_since + UNDECIDED
                     && let Some(rate) = self.sequence.points_per_second()
@@ -336,7 +328,7 @@ impl Session {
                 self.trouble = None;
                 self.undecided_since = self.now;
                 self.phase = Phase::Streaming(Watchdog::new(self.now));
-                self.counters.begin_stream(self.framer.tally());
+                self.counters.begin_stream(self.framer.buffer.tally());
             }
             Phase::Paused => {}
         }
@@ -397,7 +389,7 @@ impl Session {
         if let Phase::Streaming(watchdog) = &mut self.phase {
             watchdog.note_revolution(self.now);
         }
-        self.counters.await_revolution(self.framer.tally());
+        self.counters.await_revolution(self.framer.buffer.tally());
         self.dated(closed)
     }
 
@@ -413,7 +405,7 @@ impl Session {
 
 impl line::Protocol for Session {
     fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.spare();
+        let spare = self.framer.buffer.spare();
         self.reads.offer(spare.len());
         spare
     }
@@ -422,13 +414,13 @@ impl line::Protocol for Session {
         self.now = now;
         self.reads.note(now, len, line::Session::state(self) == State::Streaming);
         if len > 0 {
-            self.framer.commit(len);
+            self.framer.buffer.commit(len);
         }
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
-        self.framer.release(now.saturating_sub(self.reads.last_byte()));
+        self.framer.buffer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
     fn transmitted(&mut self, now: Nanos) {
@@ -454,7 +446,7 @@ impl line::Protocol for Session {
             Phase::Streaming(watchdog) => watchdog.silent_at(),
             Phase::Paused => Nanos::MAX,
         };
-        self.reads.wait(self.now, until, self.framer.hold())
+        self.reads.wait(self.now, until, self.framer.buffer.hold())
     }
 }
 
@@ -500,9 +492,9 @@ impl line::Session for Session {
     }
 
     fn account(&self) -> Account {
-        let (tally, buffered) = (self.framer.tally(), self.framer.buffered());
+        let (tally, buffered) = (self.framer.buffer.tally(), self.framer.buffer.open().len());
         let account = self.counters.account(tally, buffered, self.sequence.came_and_lost());
-        Account { restarts: self.restarts.count(), ..account }
+        Account { restarts: self.restarts.count, ..account }
     }
 
     fn begin_at(&mut self, rate: u32, _: Nanos) {
@@ -539,32 +531,6 @@ impl line::Session for Session {
     fn mark_suspect(&mut self, reasons: u8) {
         self.reads.doubt(reasons);
     }
-}
-
-/// Models and settings of the family.
-pub const FEATURES: Features = Features {
-    models: &MODELS,
-    // Enough for all models but the STL27L.
-    auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
-    modes: &[],
-    keys: &[],
-    can_rest: false,
-    speaks_unasked: true,
-    has_whole_telegrams: false,
-    has_inquiry: false,
-    contents: Contents::TURNING,
-    max_telegram: MOST * LEN,
-};
-
-/// Returns the settings that `request` has for an LDROBOT.
-pub(crate) fn check(request: &SettingsRequest) -> Result<Settings, Refusal> {
-    request.check_models(Family::Ld, &FEATURES)
-}
-
-/// Returns the head of a scan on a grid of as many beams as there is space for.
-pub(crate) fn scan_heads(settings: &Settings) -> Vec<ScanHead> {
-    let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
-    vec![ScanHead::turning(Family::Ld, beams)]
 }
 
 /// Reason why a session does not stream.
@@ -628,14 +594,6 @@ fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reason
     }
 }
 
-/// Describes a model for the configuration.
-const fn described(model: Model) -> family::Model {
-    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
-}
-
-/// All models, described for the configuration.
-const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
-
 /// Returns how many packets are returned together: as many as arrive in 10 ms.
 const fn most_together(baud: u32) -> usize {
     if baud > 500_000 { MOST } else { 3 }
@@ -653,4 +611,4 @@ const CHANGE: Nanos = 10_000 * MILLIS;
 /// Duration for which a change of the number of beams is reported.
 const SHOW_CHANGE: Nanos = 60_000 * MILLIS;
 /// Maximum number of packets that are returned together: those of an STL27L in 10 ms, one every 0.56 ms.
-const MOST: usize = 17;
+pub(crate) const MOST: usize = 17;

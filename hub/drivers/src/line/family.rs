@@ -44,6 +44,28 @@ pub struct Model {
     pub beams: usize,
 }
 
+/// Declares the models or the modes of a family, each with its name in configurations.
+macro_rules! named {
+    ($(#[doc = $doc:literal])+ $Enum:ident { $($(#[doc = $text:literal])+ $Name:ident $name:literal,)+ }) => {
+        $(#[doc = $doc])+
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum $Enum {
+            $($(#[doc = $text])+ $Name,)+
+        }
+
+        impl $Enum {
+            /// All of them.
+            pub const ALL: [$Enum; [$($name),+].len()] = [$($Enum::$Name),+];
+
+            /// Returns its name in configurations and messages.
+            pub const fn name(self) -> &'static str {
+                match self { $($Enum::$Name => $name,)+ }
+            }
+        }
+    };
+}
+pub(crate) use named;
+
 /// Maps a constant array with a constant function.
 macro_rules! table {
     ($from:expr, $map:path) => {{

@@ -4,6 +4,8 @@
 //! A packet that contains another header is therefore accepted only if a header follows it, or if the bytes from the inner
 //! header on are not a packet.
 
+use scanhub_schema::Nanos;
+
 /// Format of packets that have a fixed length and begin with a header of two bytes.
 pub trait Format {
     /// Reason why bytes that begin like a packet are not one.
@@ -37,7 +39,7 @@ pub enum Verdict<R> {
 }
 
 /// Checks whether a packet begins at the first byte of `open`. If `is_released`, incomplete packets inside it are ignored.
-pub fn judge<F: Format>(format: &F, open: &[u8], is_released: bool) -> Verdict<F::Reject> {
+fn judge<F: Format>(format: &F, open: &[u8], is_released: bool) -> Verdict<F::Reject> {
     let len = format.packet_len();
     if !format.begins(open) {
         return Verdict::Nothing(None);
@@ -82,16 +84,22 @@ pub struct Buffer<const N: usize> {
     /// `bytes[start..end]` are open.
     start: usize,
     end: usize,
+    /// Time without a byte after which no more bytes are in flight.
+    hold: Nanos,
+    /// Whether a packet is held back, because another one may begin inside it.
+    is_held: bool,
+    /// Whether it does not have to be held back any longer.
+    is_released: bool,
     tally: Tally,
 }
 
-impl<const N: usize> Default for Buffer<N> {
-    fn default() -> Self {
-        Buffer { bytes: [0; N], start: 0, end: 0, tally: Tally::default() }
-    }
-}
-
 impl<const N: usize> Buffer<N> {
+    /// Creates an empty buffer. A packet that is held back is released when the line was idle for `hold`.
+    pub fn new(hold: Nanos) -> Self {
+        let tally = Tally::default();
+        Buffer { bytes: [0; N], start: 0, end: 0, hold, is_held: false, is_released: false, tally }
+    }
+
     /// Returns the free space for the next bytes. Write to its beginning, then call [`Buffer::commit`]. Invalidates the results
     /// of [`Buffer::take`].
     pub fn spare(&mut self) -> &mut [u8] {
@@ -110,6 +118,30 @@ impl<const N: usize> Buffer<N> {
         self.end += len;
         assert!(self.end <= N, "more bytes committed than there was room");
         self.tally.read += len as u64;
+        self.is_released &= len == 0;
+    }
+
+    /// Checks whether a packet begins at the open byte number `at`.
+    pub fn judge<F: Format>(&mut self, format: &F, at: usize) -> Verdict<F::Reject> {
+        let verdict = judge(format, &self.open()[at..], self.is_released);
+        self.is_held |= matches!(verdict, Verdict::Held);
+        verdict
+    }
+
+    /// Begins to check the open bytes again.
+    pub fn begin_check(&mut self) {
+        self.is_held = false;
+    }
+
+    /// Returns how long the line must be idle until [`Buffer::release`] releases a packet that is held back. `None` if there is
+    /// none.
+    pub fn hold(&self) -> Option<Nanos> {
+        self.is_held.then_some(self.hold)
+    }
+
+    /// Handles a read that found nothing. No byte has arrived for `idle`.
+    pub fn release(&mut self, idle: Nanos) {
+        self.is_released |= self.is_held && idle >= self.hold;
     }
 
     /// Returns the open bytes.
@@ -152,6 +184,7 @@ impl<const N: usize> Buffer<N> {
     /// Discards all open bytes, for example because the rate of the line changes.
     pub fn clear(&mut self) {
         self.discard(self.end - self.start);
+        (self.is_held, self.is_released) = (false, false);
     }
 
     /// Counts a discarded header whose packet had a wrong checksum.
@@ -163,6 +196,15 @@ impl<const N: usize> Buffer<N> {
     pub fn tally(&self) -> &Tally {
         &self.tally
     }
+}
+
+/// Moves the first of `bytes` into `spare`. Returns their number.
+pub(crate) fn fill(spare: &mut [u8], bytes: &mut &[u8]) -> usize {
+    let len = spare.len().min(bytes.len());
+    let (now, later) = bytes.split_at(len);
+    spare[..len].copy_from_slice(now);
+    *bytes = later;
+    len
 }
 
 /// Length of a header, in bytes.

@@ -131,7 +131,7 @@ impl Arrivals {
 /// counts.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rhythm {
-    duration: Option<Nanos>,
+    pub(crate) duration: Option<Nanos>,
     /// Minimum duration of the last `counted` telegrams.
     least: Nanos,
     counted: u32,
@@ -154,11 +154,6 @@ impl Rhythm {
     /// Handles the arrival of the first byte of a telegram.
     pub(crate) fn begin(&mut self, first: Nanos) {
         self.first = Some(first);
-    }
-
-    /// Returns the duration of a telegram, if it is known.
-    pub(crate) fn duration(&self) -> Option<Nanos> {
-        self.duration
     }
 
     /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for

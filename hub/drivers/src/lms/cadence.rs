@@ -21,10 +21,10 @@ pub(crate) struct Cadence {
     is_steady: bool,
     lesson: Lesson,
     /// Number of scans that were due after the first one of each cadence, and of those that arrived.
-    due: u64,
+    pub(crate) due: u64,
     came: u64,
     /// Number of scans that certainly did not arrive.
-    lost: u64,
+    pub(crate) lost: u64,
     /// Minimum number of missing scans since `settled_at`. A late one is missing only for a moment.
     least: u64,
     settled_at: Nanos,
@@ -52,18 +52,6 @@ impl Cadence {
             least: 0,
             settled_at: 0,
         }
-    }
-
-    /// Returns the number of scans that the scanner must have sent since the first one of each stream. Not counted if
-    /// unknown.
-    pub(crate) fn due(&self) -> u64 {
-        self.due
-    }
-
-    /// Returns the number of those that did not arrive. A missing one counts after a second, because it may only be
-    /// late.
-    pub(crate) fn lost(&self) -> u64 {
-        self.lost
     }
 
     /// Returns the due time `slots` periods after the last scan. `None` before the scanner is known to be steady.
@@ -208,23 +196,23 @@ mod tests {
         for n in (0..100).filter(|n| ![20, 40, 41, 42].contains(n)) {
             cadence.note(n * PERIOD, false, PERIOD);
         }
-        assert_eq!((cadence.due(), cadence.lost()), (99, 1), "the last three are too new");
+        assert_eq!((cadence.due, cadence.lost), (99, 1), "the last three are too new");
         for n in 100..140 {
             cadence.note(n * PERIOD, false, PERIOD);
         }
-        assert_eq!((cadence.due(), cadence.lost()), (139, 4));
+        assert_eq!((cadence.due, cadence.lost), (139, 4));
     }
 
     #[test]
     fn delays_are_not_losses() {
         let jittery = (0..4000).map(|n| f64::from(n) + f64::from(n * 7 % 10) * 0.04);
-        assert_eq!(after_scans(jittery).lost(), 0);
+        assert_eq!(after_scans(jittery).lost, 0);
         // A network that sometimes delays scans for 200 ms, and then delivers all at once.
         let held = (0..4000).map(|n| f64::from(if n % 100 < 8 { n - n % 100 + 8 } else { n }));
         let mut cadence = Cadence::new();
         for at in held {
             cadence.note((at * PERIOD as f64) as Nanos, false, PERIOD);
-            assert_eq!(cadence.lost(), 0);
+            assert_eq!(cadence.lost, 0);
         }
     }
 
@@ -234,7 +222,7 @@ mod tests {
             let kept = |n: &u32| !n.is_multiple_of(3) || n.is_multiple_of(5);
             let scans = (0..3000).filter(kept).map(|n| f64::from(n) * drift);
             let lost = (0..3000).filter(|n| !kept(n)).count() as u64;
-            let counted = after_scans(scans).lost();
+            let counted = after_scans(scans).lost;
             assert!(counted.abs_diff(lost) <= 2, "{drift}: {counted} of {lost}");
         }
         let mut cadence = Cadence::new();
@@ -247,19 +235,19 @@ mod tests {
     fn ambiguous_gaps_are_not_counted() {
         // A scanner that always sends every other scan.
         let slow = after_scans((0..100).map(|n| f64::from(2 * n)));
-        assert_eq!((slow.due(), slow.lost()), (0, 0));
+        assert_eq!((slow.due, slow.lost), (0, 0));
         // A pause.
         let mut cadence = Cadence::new();
         (0..50).for_each(|n| cadence.note(n * PERIOD, false, PERIOD));
         cadence.rest();
         assert_eq!(cadence.after(1), None);
         (900..950).for_each(|n| cadence.note(n * PERIOD, false, PERIOD));
-        assert_eq!((cadence.due(), cadence.lost()), (98, 0));
+        assert_eq!((cadence.due, cadence.lost), (98, 0));
         // Another resolution.
         cadence.note(960 * PERIOD, false, PERIOD / 2);
         (1921..1950).for_each(|n| cadence.note(n * PERIOD / 2, false, PERIOD / 2));
         cadence.rest();
-        assert_eq!(cadence.lost(), 0);
+        assert_eq!(cadence.lost, 0);
     }
 
     #[test]

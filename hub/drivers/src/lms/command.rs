@@ -6,157 +6,133 @@ use crate::lms::operating::{self, Operating};
 use crate::lms::telegram::{Encoded, Telegram, Writer};
 use crate::lms::variant::{Baud, Variant};
 
-/// A request that is forgotten at power-off.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request {
-    /// 10h: restart, as after power-on; clears the fault memory.
-    Reset,
-    /// 20h 24h: send all values of every scan from now on.
-    Stream,
-    /// 20h 25h: values on request only; so this is the stop command, and the way out of installation mode.
-    Stop,
-    /// 20h 40h, 41h, 42h, 48h: change the rate of the line; acknowledged at the old one, forgotten at power-off.
-    Baud(Baud),
-    /// 20h with any other mode.
-    Operate(Operating),
-    /// 30h: one telegram of values, selected by the byte (Telegram listing 7-14): 1 all, 2 vertical minimum, 3 taught,
-    /// 6 every second, 7 every twentieth, 8 the current partial scan.
-    Values(u8),
-    /// 31h: status of the sensor; the reply is [`crate::lms::reply::Reply::Status`].
-    Status,
-    /// 32h: errors that are and that were.
-    Errors,
-    /// 35h: hours and power-ons; LMS 211, 221 and 291 only.
-    Counters,
-    /// 36h: mean values of so many scans, 2 to 250.
-    Means(u8),
-    /// 37h: values of a sub-range; bit 15 of its first asks for direct output of a partial scan.
-    Range(Span),
-    /// 3Ah: type and firmware.
-    Type,
-    /// 3Bh: switch angle and resolution; forgotten at power-off.
-    Variant(Variant),
-    /// 3Eh: values of a sub-range with those of the fields A, B and C; at most 100.
-    RangeFields(Span),
-    /// 3Fh: mean values of so many scans in a sub-range.
-    RangeMeans(u8, Span),
-    /// 41h: switch the set of fields. The parameters as they are: their layout is not known here.
-    FieldSet(Raw),
-    /// 44h: all ranges, and the reflectivity of a sub-range; LMS S14 only.
-    Reflectivity(Span),
-    /// 45h: read a field. The parameters as they are: their layout is not known here.
-    Field(Raw),
-    /// 4Ah: what the field outputs are at.
-    Outputs,
-    /// 69h: the ranges of the positioning aid.
-    Positioning,
-    /// 74h: first part of the configuration, with unit and measuring mode.
-    Configuration,
-    /// 75h: ranges and reflectivities of one to five sub-ranges.
-    Reflectivities(Spans),
-    /// 76h: a sub-range as Cartesian coordinates, at most 200.
-    Cartesian(Span),
-    /// 7Bh: second part of the configuration.
-    Configuration2,
+/// Part of a request: encoded after the command, and decoded from the data.
+pub(crate) trait Parameter: Sized {
+    /// Decodes it from the beginning of `data`. Returns it with the rest.
+    fn read(data: &[u8]) -> Option<(Self, &[u8])>;
+
+    /// Appends it to a telegram.
+    fn write(self, writer: Writer) -> Writer;
+}
+
+/// Declares requests, each with its parameters, its code, and the byte that follows the code if it is always the same.
+macro_rules! requests {
+    ($(#[$doc:meta])* $Enum:ident by $code_of:ident {
+        $($(#[doc = $text:literal])+ $Name:ident $(($($field:ident: $Type:ty),+))? = $code:tt $(+ $after:path)?,)+
+    }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub enum $Enum {
+            $($(#[doc = $text])+ $Name $(($($Type),+))?,)+
+        }
+
+        impl $Enum {
+            /// Returns its code.
+            pub fn $code_of(self) -> u8 {
+                match self { $($Enum::$Name { .. } => $code,)+ }
+            }
+
+            /// Appends the parameters.
+            fn write_parameters(self, writer: Writer) -> Writer {
+                match self {
+                    $($Enum::$Name $(($($field),+))? => {
+                        $(let writer = writer.byte($after);)?
+                        $($(let writer = Parameter::write($field, writer);)+)?
+                        writer
+                    })+
+                }
+            }
+
+            /// Returns the request with this `code` whose parameters are exactly `data`.
+            fn read_parameters(code: u8, data: &[u8]) -> Option<$Enum> {
+                $(if code == $code {
+                    let read = || {
+                        $(let data = data.strip_prefix(&[$after])?;)?
+                        $($(let ($field, data) = <$Type as Parameter>::read(data)?;)+)?
+                        data.is_empty().then_some($Enum::$Name $(($($field),+))?)
+                    };
+                    if let Some(request) = read() {
+                        return Some(request);
+                    }
+                })+
+                None
+            }
+        }
+    };
+}
+pub(crate) use requests;
+
+requests! {
+    /// A request that is forgotten at power-off.
+    Request by command {
+        /// 10h: restart, as after power-on; clears the fault memory.
+        Reset = RESET,
+        /// 20h 24h: send all values of every scan from now on.
+        Stream = MODE + operating::STREAM,
+        /// 20h 25h: values on request only; so this is the stop command, and the way out of installation mode.
+        Stop = MODE + operating::ON_REQUEST,
+        /// 20h 40h, 41h, 42h, 48h: change the rate of the line; acknowledged at the old one, forgotten at power-off.
+        Baud(baud: Baud) = MODE,
+        /// 20h with any other mode.
+        Operate(operating: Operating) = MODE,
+        /// 30h: one telegram of values, selected by the byte (Telegram listing 7-14): 1 all, 2 vertical minimum, 3 taught,
+        /// 6 every second, 7 every twentieth, 8 the current partial scan.
+        Values(number: u8) = VALUES,
+        /// 31h: status of the sensor; the reply is [`crate::lms::reply::Reply::Status`].
+        Status = STATUS,
+        /// 32h: present and past errors.
+        Errors = ERRORS,
+        /// 35h: hours and power-ons; LMS 211, 221 and 291 only.
+        Counters = COUNTERS,
+        /// 36h: mean values of this number of scans, 2 to 250.
+        Means(number: u8) = MEANS,
+        /// 37h: values of a sub-range; bit 15 of its first asks for direct output of a partial scan.
+        Range(span: Span) = RANGE,
+        /// 3Ah: type and firmware.
+        Type = TYPE,
+        /// 3Bh: switch angle and resolution; forgotten at power-off.
+        Variant(variant: Variant) = VARIANT,
+        /// 3Eh: values of a sub-range with those of the fields A, B and C; at most 100.
+        RangeFields(span: Span) = RANGE_FIELDS,
+        /// 3Fh: mean values of this number of scans in a sub-range.
+        RangeMeans(number: u8, span: Span) = RANGE_MEANS,
+        /// 41h: switch the set of fields. Its parameters are not decoded.
+        FieldSet(raw: Raw) = FIELD_SET,
+        /// 44h: all ranges, and the reflectivity of a sub-range; LMS S14 only.
+        Reflectivity(span: Span) = REFLECTIVITY,
+        /// 45h: read a field. Its parameters are not decoded.
+        Field(raw: Raw) = FIELD,
+        /// 4Ah: state of the field outputs.
+        Outputs = OUTPUTS,
+        /// 69h: the ranges of the positioning aid.
+        Positioning = POSITIONING,
+        /// 74h: first part of the configuration, with unit and measuring mode.
+        Configuration = CONFIGURATION,
+        /// 75h: ranges and reflectivities of one to five sub-ranges.
+        Reflectivities(spans: Spans) = REFLECTIVITIES,
+        /// 76h: a sub-range as Cartesian coordinates, at most 200.
+        Cartesian(span: Span) = CARTESIAN,
+        /// 7Bh: second part of the configuration.
+        Configuration2 = CONFIGURATION_2,
+    }
 }
 
 impl Request {
-    /// The telegram that says it to the sensor at `address` (0 is every sensor).
+    /// Returns the telegram with this request for the scanner at `address`; 0 is for all.
     pub fn encode(self, address: u8) -> Encoded {
-        let writer = Writer::new(address, self.command());
-        match self {
-            Request::Variant(variant) => writer.word(variant.angle_deg).word(variant.resolution_cdeg),
-            Request::Stream => writer.byte(operating::STREAM),
-            Request::Stop => writer.byte(operating::ON_REQUEST),
-            Request::Baud(baud) => writer.byte(operating::of_baud(baud)),
-            Request::Operate(operating) => operating.write(writer),
-            Request::Values(byte) | Request::Means(byte) => writer.byte(byte),
-            Request::Range(span)
-            | Request::RangeFields(span)
-            | Request::Reflectivity(span)
-            | Request::Cartesian(span) => span.write(writer),
-            Request::RangeMeans(shots, span) => span.write(writer.byte(shots)),
-            Request::Reflectivities(spans) => spans.write(writer.word(spans.as_slice().len() as u16)),
-            Request::FieldSet(raw) | Request::Field(raw) => writer.slice(raw.as_slice()),
-            Request::Reset
-            | Request::Status
-            | Request::Errors
-            | Request::Counters
-            | Request::Type
-            | Request::Outputs
-            | Request::Positioning
-            | Request::Configuration
-            | Request::Configuration2 => writer,
-        }
-        .finish()
+        self.write_parameters(Writer::new(address, self.command())).finish()
     }
 
-    /// The request that `telegram` says; `None` if it is a reply, unknown, one that writes the EEPROM, or its data are
-    /// not as they should be.
+    /// Returns the request in `telegram`. `None` if it is a reply, unknown, a request that writes the EEPROM, or has invalid
+    /// parameters.
     pub fn decode(telegram: Telegram<'_>) -> Option<Request> {
         if telegram.is_reply() {
             return None;
         }
-        let data = telegram.data();
-        Some(match (telegram.command(), data) {
-            (RESET, []) => Request::Reset,
-            (MODE, &[operating::STREAM]) => Request::Stream,
-            (MODE, &[operating::ON_REQUEST]) => Request::Stop,
-            (MODE, &[mode]) if operating::baud_of(mode).is_some() => Request::Baud(operating::baud_of(mode)?),
-            (MODE, data) => Request::Operate(Operating::decode(data)?),
-            (VALUES, &[selection]) => Request::Values(selection),
-            (STATUS, []) => Request::Status,
-            (ERRORS, []) => Request::Errors,
-            (COUNTERS, []) => Request::Counters,
-            (MEANS, &[shots]) => Request::Means(shots),
-            (RANGE, data) => Request::Range(Span::read(data)?),
-            (TYPE, []) => Request::Type,
-            (VARIANT, &[a, b, c, d]) => {
-                Request::Variant(Variant::new(u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d]))?)
-            }
-            (RANGE_FIELDS, data) => Request::RangeFields(Span::read(data)?),
-            (RANGE_MEANS, &[shots, ref span @ ..]) => Request::RangeMeans(shots, Span::read(span)?),
-            (FIELD_SET, data) => Request::FieldSet(Raw::new(data)?),
-            (REFLECTIVITY, data) => Request::Reflectivity(Span::read(data)?),
-            (FIELD, data) => Request::Field(Raw::new(data)?),
-            (OUTPUTS, []) => Request::Outputs,
-            (POSITIONING, []) => Request::Positioning,
-            (CONFIGURATION, []) => Request::Configuration,
-            (REFLECTIVITIES, data) => Request::Reflectivities(Spans::read_counted(data)?),
-            (CARTESIAN, data) => Request::Cartesian(Span::read(data)?),
-            (CONFIGURATION_2, []) => Request::Configuration2,
-            _ => return None,
-        })
+        Request::read_parameters(telegram.command(), telegram.data())
     }
 
-    /// The command byte.
-    pub fn command(self) -> u8 {
-        match self {
-            Request::Reset => RESET,
-            Request::Stream | Request::Stop | Request::Baud(_) | Request::Operate(_) => MODE,
-            Request::Values(_) => VALUES,
-            Request::Status => STATUS,
-            Request::Errors => ERRORS,
-            Request::Counters => COUNTERS,
-            Request::Means(_) => MEANS,
-            Request::Range(_) => RANGE,
-            Request::Type => TYPE,
-            Request::Variant(_) => VARIANT,
-            Request::RangeFields(_) => RANGE_FIELDS,
-            Request::RangeMeans(..) => RANGE_MEANS,
-            Request::FieldSet(_) => FIELD_SET,
-            Request::Reflectivity(_) => REFLECTIVITY,
-            Request::Field(_) => FIELD,
-            Request::Outputs => OUTPUTS,
-            Request::Positioning => POSITIONING,
-            Request::Configuration => CONFIGURATION,
-            Request::Reflectivities(_) => REFLECTIVITIES,
-            Request::Cartesian(_) => CARTESIAN,
-            Request::Configuration2 => CONFIGURATION_2,
-        }
-    }
-
-    /// Into installation mode, by its `password`; [`Request::Stop`] leads out again.
+    /// Returns the request for installation mode, with its `password`. [`Request::Stop`] ends that mode.
     pub fn install(password: Password) -> Request {
         Request::Operate(Operating::Installation(password))
     }
@@ -219,17 +195,34 @@ pub struct Span {
     pub last: u16,
 }
 
-impl Span {
-    /// Bytes on the wire: two words.
-    pub const LEN: usize = 4;
-
-    /// The span that exactly these four bytes are.
-    pub(crate) fn read(bytes: &[u8]) -> Option<Span> {
-        let &[a, b, c, d] = bytes else { return None };
-        Some(Span { first: u16::from_le_bytes([a, b]), last: u16::from_le_bytes([c, d]) })
+impl Parameter for u8 {
+    fn read(data: &[u8]) -> Option<(u8, &[u8])> {
+        data.split_first().map(|(byte, rest)| (*byte, rest))
     }
 
-    pub(crate) fn write(self, writer: Writer) -> Writer {
+    fn write(self, writer: Writer) -> Writer {
+        writer.byte(self)
+    }
+}
+
+impl Parameter for u16 {
+    fn read(data: &[u8]) -> Option<(u16, &[u8])> {
+        data.split_first_chunk().map(|(word, rest)| (u16::from_le_bytes(*word), rest))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
+        writer.word(self)
+    }
+}
+
+impl Parameter for Span {
+    fn read(data: &[u8]) -> Option<(Span, &[u8])> {
+        let (first, data) = u16::read(data)?;
+        let (last, data) = u16::read(data)?;
+        Some((Span { first, last }, data))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
         writer.word(self.first).word(self.last)
     }
 }
@@ -242,10 +235,10 @@ pub struct Spans {
 }
 
 impl Spans {
-    /// As many as a telegram may name (Telegram listing, 75h).
+    /// Maximum number in a telegram (Telegram listing, 75h).
     pub const MAX: usize = 5;
 
-    /// `None` if there are none, or more than five.
+    /// Creates the list. `None` if it is empty, or has more than five sub-ranges.
     pub fn new(spans: &[Span]) -> Option<Spans> {
         if spans.is_empty() {
             return None;
@@ -255,40 +248,60 @@ impl Spans {
         Some(Spans { list, len: spans.len() as u8 })
     }
 
-    /// The spans in their order.
+    /// Returns the sub-ranges in their order.
     pub fn as_slice(&self) -> &[Span] {
         &self.list[..usize::from(self.len)]
     }
+}
 
-    /// A word that counts them, then as many.
-    pub(crate) fn read_counted(bytes: &[u8]) -> Option<Spans> {
-        let (count, rest) = bytes.split_first_chunk()?;
-        let count = usize::from(u16::from_le_bytes(*count));
-        if count > Spans::MAX || rest.len() != count * Span::LEN {
-            return None;
-        }
+impl Parameter for Spans {
+    fn read(data: &[u8]) -> Option<(Spans, &[u8])> {
+        let (count, mut data) = u16::read(data)?;
         let mut list = [Span::default(); Spans::MAX];
-        for (span, bytes) in list.iter_mut().zip(rest.chunks_exact(Span::LEN)) {
-            *span = Span::read(bytes)?;
+        for span in list.get_mut(..count.into())? {
+            (*span, data) = Span::read(data)?;
         }
-        Spans::new(&list[..count])
+        Some((Spans::new(&list[..count.into()])?, data))
     }
 
-    pub(crate) fn write(&self, writer: Writer) -> Writer {
+    fn write(self, writer: Writer) -> Writer {
+        let writer = writer.word(self.len.into());
         self.as_slice().iter().fold(writer, |writer, span| span.write(writer))
     }
 }
 
-/// The eight characters that open the installation mode.
+/// Password of the installation mode: eight characters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Password(pub [u8; 8]);
 
 impl Password {
-    /// The one that every sensor leaves the factory with (Telegram listing 6-4).
+    /// Password of a factory-new scanner (Telegram listing 6-4).
     pub const FACTORY: Password = Password(*b"SICK_LMS");
 }
 
-/// Parameters of which no layout is known here: at most sixteen bytes, as they are.
+impl Parameter for Password {
+    fn read(data: &[u8]) -> Option<(Password, &[u8])> {
+        data.split_first_chunk().map(|(password, rest)| (Password(*password), rest))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
+        writer.slice(&self.0)
+    }
+}
+
+impl Parameter for Variant {
+    fn read(data: &[u8]) -> Option<(Variant, &[u8])> {
+        let (angle_deg, data) = u16::read(data)?;
+        let (resolution_cdeg, data) = u16::read(data)?;
+        Some((Variant::new(angle_deg, resolution_cdeg)?, data))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
+        writer.word(self.angle_deg).word(self.resolution_cdeg)
+    }
+}
+
+/// Parameters without a known layout: at most sixteen bytes, unchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Raw {
     bytes: [u8; Raw::MAX],
@@ -296,19 +309,29 @@ pub struct Raw {
 }
 
 impl Raw {
-    /// Longest parameters that are kept.
+    /// Maximum length in bytes.
     pub const MAX: usize = 16;
 
-    /// `None` if they are longer than [`Raw::MAX`].
+    /// Copies `bytes`. `None` if they are longer than [`Raw::MAX`].
     pub fn new(bytes: &[u8]) -> Option<Raw> {
         let mut kept = [0; Raw::MAX];
         kept.get_mut(..bytes.len())?.copy_from_slice(bytes);
         Some(Raw { bytes: kept, len: bytes.len() as u8 })
     }
 
-    /// The bytes.
+    /// Returns the bytes.
     pub fn as_slice(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
+    }
+}
+
+impl Parameter for Raw {
+    fn read(data: &[u8]) -> Option<(Raw, &[u8])> {
+        Raw::new(data).map(|raw| (raw, &[][..]))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
+        writer.slice(self.as_slice())
     }
 }
 
@@ -407,10 +430,10 @@ mod tests {
         assert_eq!(Spans::new(&[]), None);
         assert_eq!(Spans::new(&[span; 6]), None);
         assert_eq!(Spans::new(&[span; 5]).unwrap().as_slice(), [span; 5]);
-        assert_eq!(Spans::read_counted(&[1, 0, 1, 0, 2, 0]), Spans::new(&[span]));
-        assert_eq!(Spans::read_counted(&[2, 0, 1, 0, 2, 0]), None);
-        assert_eq!(Spans::read_counted(&[0, 0]), None);
-        assert_eq!(Spans::read_counted(&[0]), None);
+        assert_eq!(Spans::read(&[1, 0, 1, 0, 2, 0, 9]), Spans::new(&[span]).map(|spans| (spans, &[9][..])));
+        assert_eq!(Spans::read(&[2, 0, 1, 0, 2, 0]), None);
+        assert_eq!(Spans::read(&[0, 0]), None);
+        assert_eq!(Spans::read(&[0]), None);
     }
 
     #[test]

@@ -18,16 +18,6 @@ impl<'a> Configuration<'a> {
         self.0
     }
 
-    /// Objects nearer than so many centimetres are not seen.
-    pub fn blanking_cm(&self) -> u16 {
-        u16::from_le_bytes([self.0[0], self.0[1]])
-    }
-
-    /// Peak threshold of an LMS 200 or 211 and 221; of a 291 the sensitivity (0 to 3).
-    pub fn sensitivity(&self) -> u8 {
-        self.0[3]
-    }
-
     /// Bit 0 availability level 3, bit 1 real-time indices, bit 2 availability level 2.
     pub fn availability(&self) -> u8 {
         self.0[4]

@@ -25,8 +25,8 @@ pub(crate) struct Dialogue {
     phase: Phase,
     /// The request that is being sent, or whose reply is expected.
     open: Option<Outgoing>,
-    rate: LineRate,
-    sensor: Sensor,
+    pub(crate) rate: LineRate,
+    pub(crate) sensor: Sensor,
     /// Identity that an earlier session saved; used until the first request is sent.
     recalled: Option<Identity>,
     /// Reason why the session does not stream now. [`Dialogue::trouble`] adds those that persist.
@@ -40,7 +40,7 @@ pub(crate) struct Dialogue {
     has_received: bool,
     /// Time since which no telegram has arrived.
     quiet_since: Nanos,
-    resyncs: u64,
+    pub(crate) resyncs: u64,
     restarts: Restarts,
 }
 
@@ -101,11 +101,6 @@ impl Dialogue {
         }
     }
 
-    /// Returns the rate of the line.
-    pub(crate) fn rate(&self) -> &LineRate {
-        &self.rate
-    }
-
     /// Handles that the port cannot have the rate to which it was to be set.
     pub(crate) fn reject_rate(&mut self) {
         self.rate.reject();
@@ -116,22 +111,12 @@ impl Dialogue {
         self.rate.take_change()
     }
 
-    /// Returns what the scanner has reported.
-    pub(crate) fn sensor(&self) -> &Sensor {
-        &self.sensor
-    }
-
     /// Returns the identity of a scanner that streams, for a later session.
     pub(crate) fn identity(&self) -> Option<line::Identity> {
         match self.phase {
             Phase::Streaming { header, .. } => self.sensor.identity(header).map(Identity::to_bytes),
             _ => None,
         }
-    }
-
-    /// Returns the number of restarts of the session.
-    pub(crate) fn resyncs(&self) -> u64 {
-        self.resyncs
     }
 
     /// Returns the number of restarts of the scanner.
@@ -144,7 +129,7 @@ impl Dialogue {
             _ if self.is_paused => State::Paused,
             Phase::Listening { shown, .. } => shown,
             Phase::Probing { .. } => State::Probing,
-            Phase::Starting(_) if self.rate.baud() != self.rate.target() => State::Switching,
+            Phase::Starting(_) if self.rate.baud != self.rate.target => State::Switching,
             Phase::Starting(_) => State::Starting,
             Phase::Streaming { .. } | Phase::Following => State::Streaming,
             Phase::Paused { .. } => State::Paused,
@@ -173,10 +158,10 @@ impl Dialogue {
     /// Handles that a byte of the open request was written at `now`.
     pub(crate) fn transmitted(&mut self, now: Nanos) {
         let Some(open) = &mut self.open else { return };
-        open.transmitted(now, self.rate.baud());
+        open.transmitted(now, self.rate.baud);
         if self.settings.fixed_rate {
             // On a network, the first bytes of a reply may be all of it.
-            open.hear(self.rate.baud());
+            open.hear(self.rate.baud);
         }
     }
 
@@ -201,7 +186,7 @@ impl Dialogue {
         };
         let Some(request) = &self.open else { return phase_ends_at };
         let next_byte_at = request.next_at().unwrap_or(Nanos::MAX);
-        phase_ends_at.min(request.give_up_at()).min(next_byte_at)
+        phase_ends_at.min(request.give_up_at).min(next_byte_at)
     }
 
     /// Handles a deadline that has passed.
@@ -222,7 +207,7 @@ impl Dialogue {
             }
             _ => {}
         }
-        if self.open.as_ref().is_some_and(|open| now >= open.give_up_at()) {
+        if self.open.as_ref().is_some_and(|open| now >= open.give_up_at) {
             self.retry(now);
         }
     }
@@ -231,14 +216,14 @@ impl Dialogue {
     pub(crate) fn on_bytes(&mut self) {
         self.has_received = true;
         if let Some(open) = &mut self.open {
-            open.hear(self.rate.baud());
+            open.hear(self.rate.baud);
         }
     }
 
     /// Handles an ACK.
     pub(crate) fn on_acknowledge(&mut self, now: Nanos) {
         if let Some(open) = self.open.as_mut().filter(|open| open.is_out()) {
-            open.acknowledged(now, self.rate.baud());
+            open.acknowledged(now, self.rate.baud);
         }
     }
 
@@ -291,7 +276,7 @@ impl Dialogue {
         let next_silence = self.silent_at(now);
         match self.phase {
             // It arrived at the previous rate.
-            _ if self.rate.is_changed() => return,
+            _ if self.rate.is_changed => return,
             Phase::Streaming { header, silent_at: ref mut at, .. } => {
                 // The framer accepted a telegram of another kind before this stream was known.
                 if telegram.bytes().starts_with(&header) {
@@ -310,23 +295,23 @@ impl Dialogue {
                 self.stream(telegram, measured, now);
             }
             Phase::Listening { .. } | Phase::Probing { .. } => {
-                let is_at_rate = self.rate.baud() == self.rate.target();
+                let is_at_rate = self.rate.baud == self.rate.target;
                 if is_at_rate && measured.is_some_and(|measured| self.is_requested(measured)) {
                     self.stream(telegram, measured, now);
                 } else {
                     self.sensor.streams = true;
-                    self.restarts.note_found(self.rate.baud(), false);
+                    self.restarts.note_found(self.rate.baud, false);
                     self.proceed(Start::CHECK, now);
                 }
             }
-            Phase::Starting(start) if start.step() == Step::Stream && measured.is_some() => {
+            Phase::Starting(start) if start.step == Step::Stream && measured.is_some() => {
                 if self.open.as_ref().is_none_or(Outgoing::is_out) {
                     self.stream(telegram, measured, now);
                 }
             }
             Phase::Starting(_) => {}
         }
-        if self.open.as_ref().is_some_and(|open| open.out_at().is_some_and(|out| first > out + OVERLOOKED)) {
+        if self.open.as_ref().is_some_and(|open| open.out_at.is_some_and(|out| first > out + OVERLOOKED)) {
             self.retry(now);
         }
     }
@@ -358,7 +343,7 @@ impl Dialogue {
             Phase::Probing { .. } => {
                 self.rate.note_found();
                 let is_idle = matches!(reply, Some(Reply::Status(_))) && !self.sensor.streams;
-                self.restarts.note_found(self.rate.baud(), is_idle);
+                self.restarts.note_found(self.rate.baud, is_idle);
                 self.trouble
                     .take_if(|trouble| matches!(trouble, Trouble::NoAnswer { .. } | Trouble::Silence));
                 if request == Request::Type {
@@ -385,7 +370,7 @@ impl Dialogue {
         let Some(open) = &mut self.open else { return };
         let request = open.request;
         // A mode change may have happened. Do not repeat it, but check the state.
-        let is_acknowledged = open.reply() == MODE_REPLY && open.is_acknowledged();
+        let is_acknowledged = open.reply() == MODE_REPLY && open.acknowledged;
         if !is_acknowledged && open.again(at) {
             return;
         }
@@ -450,9 +435,9 @@ impl Dialogue {
         let (round, turn) = (attempt / SEARCH_ORDER.len(), attempt % SEARCH_ORDER.len());
         let baud = self.rate.of_turn(turn);
         let is_patient = round % 2 == 1;
-        let is_usual = baud == self.rate.target() || self.settings.fixed_rate;
+        let is_usual = baud == self.rate.target || self.settings.fixed_rate;
         let is_brief = !is_usual && !is_patient && !self.has_received && !self.is_paused;
-        let not_before = if baud == self.rate.baud() { now } else { now + SETTLE };
+        let not_before = if baud == self.rate.baud { now } else { now + SETTLE };
         self.rate.set(baud);
         self.ask(if is_brief { Request::Type } else { Request::Status }, not_before, 1);
         if let Some(open) = self.open.as_mut().filter(|_| is_patient) {
@@ -474,7 +459,7 @@ impl Dialogue {
             self.trouble = self.has_received.then_some(Trouble::NotStopped);
             return;
         }
-        let baud = self.settings.fixed_rate.then_some(self.rate.baud());
+        let baud = self.settings.fixed_rate.then_some(self.rate.baud);
         let seconds = coarse(now.saturating_sub(self.quiet_since) / (1_000 * MILLIS));
         if !self.is_paused && seconds > 0 && !self.rate.has_lost_scanner() {
             self.trouble = Some(Trouble::NoAnswer { baud, seconds });
@@ -491,13 +476,13 @@ impl Dialogue {
 
     /// Continues a start, now that it is known what the scanner does.
     fn proceed(&mut self, start: Start, now: Nanos) {
-        let is_at_rate = self.rate.baud() == self.rate.target();
+        let is_at_rate = self.rate.baud == self.rate.target;
         self.enter(start.proceed(&self.sensor, is_at_rate, self.settings.variant), now);
     }
 
     /// Sends the request of the step of `start`.
     fn enter(&mut self, start: Start, now: Nanos) {
-        let (request, tries) = start.request(self.rate.target(), self.settings.variant);
+        let (request, tries) = start.request(self.rate.target, self.settings.variant);
         self.restarts.streamed_at = None;
         self.phase = Phase::Starting(start);
         self.ask(request, now, tries);
@@ -508,7 +493,7 @@ impl Dialogue {
         let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
         let is_done = matches!(reply, Some(Reply::Variant { done: true, .. }));
         let start = start.after(request, reply.as_ref());
-        match start.step() {
+        match start.step {
             Step::Baud if failed && start.may_be_in_other_mode() => self.enter(start.check(), now),
             Step::Stop | Step::Baud | Step::Stream if failed => {
                 self.trouble = Some(Trouble::Refused(request));
@@ -524,7 +509,7 @@ impl Dialogue {
                 self.enter(start.check(), now + SETTLE);
             }
             Step::Variant | Step::Type | Step::Configuration => {
-                if start.step() == Step::Variant {
+                if start.step == Step::Variant {
                     self.variant_refused = !is_done;
                 }
                 self.enter(start.settle(&self.sensor, self.settings.variant), now);
@@ -545,7 +530,7 @@ impl Dialogue {
     /// Handles that `request`, which belongs to the step of `start`, had no reply in all its tries, or that the scanner
     /// acknowledged it and did not report the result.
     fn on_no_reply(&mut self, start: Start, request: Request, is_acknowledged: bool, at: Nanos) {
-        let is_optional = match start.step() {
+        let is_optional = match start.step {
             Step::Variant => {
                 self.variant_refused = true;
                 true
@@ -573,7 +558,7 @@ impl Dialogue {
     /// Returns the time between two telegrams of the requested variant.
     fn period(&self) -> Nanos {
         let variant = self.settings.variant;
-        variant.period(2 * variant.beams() + BYTES_BESIDES_VALUES, self.rate.target().rate())
+        variant.period(2 * variant.beams() + BYTES_BESIDES_VALUES, self.rate.target.rate())
     }
 
     /// Returns when a stream is silent if no measured data arrive: after a second, on a slow line after two telegrams.
@@ -591,7 +576,7 @@ impl Dialogue {
         self.trouble = None;
         self.variant_refused = !is_requested;
         self.sensor.streams = true;
-        self.restarts.streamed_at = Some(self.rate.baud());
+        self.restarts.streamed_at = Some(self.rate.baud);
         let silent_at = self.silent_at(now);
         // A reply may still arrive to a complete request. The scanner must drop a partial one before the next.
         let unsent = self.open.take_if(|open| !open.is_out());
@@ -629,7 +614,7 @@ impl Dialogue {
                 let is_rate_unknown = match phase {
                     Phase::Probing { .. } | Phase::Listening { shown: State::Probing, .. } => true,
                     // It may change at this moment.
-                    Phase::Starting(start) => start.step() == Step::Baud,
+                    Phase::Starting(start) => start.step == Step::Baud,
                     _ => false,
                 };
                 if is_rate_unknown { self.probe(now, 0) } else { self.stop(now) }

@@ -65,7 +65,7 @@ impl<R: Say> Exchange<R> {
     pub fn handle_timeout(&mut self, now: Nanos) -> bool {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
-        self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
+        self.open.as_ref().is_some_and(|open| now >= open.give_up_at)
     }
 
     /// Handles that a byte is about to be written, like
@@ -156,7 +156,7 @@ impl<R: Say> Exchange<R> {
                     return Output::Transmit { bytes: open.next_byte(), not_before };
                 }
                 Some(not_before) => until = until.min(not_before),
-                None => until = until.min(open.give_up_at()),
+                None => until = until.min(open.give_up_at),
             }
         }
         if let Some(hold) = self.framer.hold() {
@@ -230,13 +230,13 @@ pub(crate) struct Outgoing<R = Request> {
     tries_left: u8,
     /// Additional time for each wait for the acknowledgment.
     patience: Nanos,
-    acknowledged: bool,
+    pub(crate) acknowledged: bool,
     /// Whether a byte has arrived since the last one was sent.
     is_heard: bool,
     /// Time at which the last byte was sent.
-    out_at: Option<Nanos>,
+    pub(crate) out_at: Option<Nanos>,
     /// End of the wait for the reply, which begins with the last byte.
-    give_up_at: Nanos,
+    pub(crate) give_up_at: Nanos,
 }
 
 impl<R: Say> Outgoing<R> {
@@ -315,16 +315,6 @@ impl<R: Say> Outgoing<R> {
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
 
-    /// Returns when to call [`Outgoing::again`] if no reply has arrived. Never while the request is being sent.
-    pub(crate) fn give_up_at(&self) -> Nanos {
-        self.give_up_at
-    }
-
-    /// Returns whether the scanner has acknowledged it.
-    pub(crate) fn is_acknowledged(&self) -> bool {
-        self.acknowledged
-    }
-
     /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
     /// dropped the request, and it cannot have received its last byte. This does not count as a try. After
     /// [`MAX_RESTARTS`] the request is sent to its end anyway, so that the wait for its reply ends.
@@ -337,11 +327,6 @@ impl<R: Say> Outgoing<R> {
             (self.sent, self.not_before) = (0, now + FORGOTTEN);
         }
         is_late
-    }
-
-    /// Returns when the last byte was sent. `None` while there are more.
-    pub(crate) fn out_at(&self) -> Option<Nanos> {
-        self.out_at
     }
 
     /// Returns the command byte of its reply.
@@ -494,14 +479,14 @@ mod tests {
             outgoing.transmitted(now, Baud::B500000);
         }
         assert!(outgoing.is_out());
-        assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT);
+        assert_eq!(outgoing.give_up_at, now + ACKNOWLEDGE_TIMEOUT);
         // The bytes may be the start of the longest reply, which starts once.
         for _ in 0..2 {
             outgoing.hear(Baud::B500000);
-            assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));
+            assert_eq!(outgoing.give_up_at, now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));
         }
         assert!(outgoing.again(now));
-        assert!(!outgoing.is_out() && outgoing.out_at().is_none());
+        assert!(!outgoing.is_out() && outgoing.out_at.is_none());
         assert!(!outgoing.again(now));
     }
 }

@@ -1,43 +1,30 @@
 //! The members of the family, and what each of them cannot do, with the reason. Recognised from what a sensor says of
 //! itself; knows nothing of a particular sensor's settings.
 
+use crate::line::family::named;
 use crate::lms::command::{
     CARTESIAN, COUNTERS, FIELD, FIELD_SET, RANGE_FIELDS, REFLECTIVITIES, REFLECTIVITY, Request,
 };
 use crate::lms::operating::Operating;
 use crate::lms::variant::{Unit, Variant};
 
-/// A type of sensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Family {
-    /// Indoors.
-    Lms200,
-    /// Outdoors, behind a window of 100 degrees.
-    Lms211,
-    /// Outdoors; an LMS 220 is one.
-    Lms221,
-    /// Indoors, long range.
-    Lms291,
-    /// Version S14 of an LMS 211, 221 or 291: twice as fast, 90 degrees at 0.5 and nothing else.
-    Fast,
+named! {
+    /// A type of sensor.
+    Family {
+        /// Indoors.
+        Lms200 "lms200",
+        /// Outdoors, behind a window of 100 degrees.
+        Lms211 "lms211",
+        /// Outdoors; an LMS 220 is one.
+        Lms221 "lms221",
+        /// Indoors, long range.
+        Lms291 "lms291",
+        /// Version S14 of an LMS 211, 221 or 291: twice as fast, 90 degrees at 0.5 and nothing else.
+        Fast "s14",
+    }
 }
 
 impl Family {
-    /// Every one.
-    pub const ALL: [Family; 5] =
-        [Family::Lms200, Family::Lms211, Family::Lms221, Family::Lms291, Family::Fast];
-
-    /// The name in configurations and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Family::Lms200 => "lms200",
-            Family::Lms211 => "lms211",
-            Family::Lms221 => "lms221",
-            Family::Lms291 => "lms291",
-            Family::Fast => "s14",
-        }
-    }
-
     /// The one that is called so in configurations.
     pub fn of_name(name: &str) -> Option<Family> {
         Family::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))

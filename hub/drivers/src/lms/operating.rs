@@ -1,119 +1,59 @@
-//! Operating modes: what follows command 20h. The two that every conversation needs, and the rates, are requests of
-//! their own; all others are here.
+//! Operating modes, which follow command 20h. The two that every session needs, and the rates, are separate requests.
 
-use crate::lms::command::{Password, Raw, Span, Spans};
+use crate::lms::command::{Parameter, Password, Raw, Span, Spans, requests};
 use crate::lms::telegram::Writer;
 use crate::lms::variant::Baud;
 
-/// An operating mode beside [`crate::lms::command::Request::Stream`], `Stop` and `Baud` (Telegram listing 7.3).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Operating {
-    /// 00h: installation, the only mode in which the EEPROM can be written; the fields' outputs are blocked in it.
-    Installation(Password),
-    /// 10h: diagnosis.
-    Diagnosis,
-    /// 20h: the least value of each segment, continuously.
-    SegmentMinimum,
-    /// 21h: the same, when an object is in a field.
-    SegmentMinimumOnObject,
-    /// 22h: the least vertical distance, continuously.
-    VerticalMinimum,
-    /// 23h: the same, when an object is in a field.
-    VerticalMinimumOnObject,
-    /// 26h: mean values of so many scans, continuously; each telegram is a B6h.
-    Means(u8),
-    /// 27h: a sub-range, continuously; each telegram is a B7h.
-    Range(Span),
-    /// 28h: mean values of a sub-range, continuously; BFh.
-    RangeMeans(u8, Span),
-    /// 29h: a sub-range with field values, continuously; BEh.
-    RangeFields(Span),
-    /// 2Ah: each mirror turn as soon as it is through; B0h of partial scans.
-    Partial,
-    /// 2Bh: ranges and reflectivities of sub-ranges, continuously; F5h.
-    Reflectivities(Spans),
-    /// 2Ch: the least value of each segment in a sub-range. The parameters as they are: their layout is not known here.
-    SegmentMinimumOfRange(Raw),
-    /// 2Eh: records for navigation.
-    Navigation,
-    /// 30h: asks whether a password is right.
-    TestPassword(Password),
-    /// 50h: ranges, and reflectivities of a sub-range, continuously; C4h. LMS S14 only.
-    Reflectivity(Span),
+requests! {
+    /// An operating mode other than [`crate::lms::command::Request::Stream`], `Stop` and `Baud` (Telegram listing 7.3).
+    Operating by byte {
+        /// 00h: installation, the only mode in which the EEPROM can be written; the fields' outputs are blocked in it.
+        Installation(password: Password) = INSTALLATION,
+        /// 10h: diagnosis.
+        Diagnosis = 0x10,
+        /// 20h: the lowest value of each segment, continuously.
+        SegmentMinimum = 0x20,
+        /// 21h: the lowest value of each segment, when an object is in a field.
+        SegmentMinimumOnObject = 0x21,
+        /// 22h: the shortest vertical distance, continuously.
+        VerticalMinimum = 0x22,
+        /// 23h: the shortest vertical distance, when an object is in a field.
+        VerticalMinimumOnObject = 0x23,
+        /// 26h: mean values of this number of scans, continuously; each telegram is a B6h.
+        Means(number: u8) = MEANS,
+        /// 27h: a sub-range, continuously; each telegram is a B7h.
+        Range(span: Span) = RANGE,
+        /// 28h: mean values of a sub-range, continuously; BFh.
+        RangeMeans(number: u8, span: Span) = RANGE_MEANS,
+        /// 29h: a sub-range with field values, continuously; BEh.
+        RangeFields(span: Span) = RANGE_FIELDS,
+        /// 2Ah: each mirror turn as soon as it is complete; B0h of partial scans.
+        Partial = PARTIAL,
+        /// 2Bh: ranges and reflectivities of sub-ranges, continuously; F5h.
+        Reflectivities(spans: Spans) = REFLECTIVITIES,
+        /// 2Ch: the lowest value of each segment in a sub-range. Its parameters are not decoded.
+        SegmentMinimumOfRange(raw: Raw) = 0x2C,
+        /// 2Eh: records for navigation.
+        Navigation = 0x2E,
+        /// 30h: tests a password.
+        TestPassword(password: Password) = 0x30,
+        /// 50h: ranges, and reflectivities of a sub-range, continuously; C4h. LMS S14 only.
+        Reflectivity(span: Span) = 0x50,
+    }
 }
 
-impl Operating {
-    /// The mode that `data`, all bytes after command 20h, ask for.
-    pub(crate) fn decode(data: &[u8]) -> Option<Operating> {
+impl Parameter for Operating {
+    fn read(data: &[u8]) -> Option<(Operating, &[u8])> {
         let (&mode, parameters) = data.split_first()?;
-        Some(match (mode, parameters) {
-            (INSTALLATION, _) => Operating::Installation(Password(parameters.try_into().ok()?)),
-            (0x10, []) => Operating::Diagnosis,
-            (0x20, []) => Operating::SegmentMinimum,
-            (0x21, []) => Operating::SegmentMinimumOnObject,
-            (0x22, []) => Operating::VerticalMinimum,
-            (0x23, []) => Operating::VerticalMinimumOnObject,
-            (MEANS, &[shots]) => Operating::Means(shots),
-            (RANGE, span) => Operating::Range(Span::read(span)?),
-            (RANGE_MEANS, &[shots, ref span @ ..]) => Operating::RangeMeans(shots, Span::read(span)?),
-            (RANGE_FIELDS, span) => Operating::RangeFields(Span::read(span)?),
-            (PARTIAL, []) => Operating::Partial,
-            (REFLECTIVITIES, spans) => Operating::Reflectivities(Spans::read_counted(spans)?),
-            (0x2C, raw) => Operating::SegmentMinimumOfRange(Raw::new(raw)?),
-            (0x2E, []) => Operating::Navigation,
-            (0x30, _) => Operating::TestPassword(Password(parameters.try_into().ok()?)),
-            (0x50, span) => Operating::Reflectivity(Span::read(span)?),
-            _ => return None,
-        })
+        Some((Operating::read_parameters(mode, parameters)?, &[]))
     }
 
-    pub(crate) fn write(self, writer: Writer) -> Writer {
-        let writer = writer.byte(self.byte());
-        match self {
-            Operating::Installation(password) | Operating::TestPassword(password) => {
-                writer.slice(&password.0)
-            }
-            Operating::Means(shots) => writer.byte(shots),
-            Operating::Range(span) | Operating::RangeFields(span) | Operating::Reflectivity(span) => {
-                span.write(writer)
-            }
-            Operating::RangeMeans(shots, span) => span.write(writer.byte(shots)),
-            Operating::Reflectivities(spans) => spans.write(writer.word(spans.as_slice().len() as u16)),
-            Operating::SegmentMinimumOfRange(raw) => writer.slice(raw.as_slice()),
-            Operating::Diagnosis
-            | Operating::SegmentMinimum
-            | Operating::SegmentMinimumOnObject
-            | Operating::VerticalMinimum
-            | Operating::VerticalMinimumOnObject
-            | Operating::Partial
-            | Operating::Navigation => writer,
-        }
-    }
-
-    /// The byte after command 20h, which a status report tells.
-    pub fn byte(self) -> u8 {
-        match self {
-            Operating::Installation(_) => INSTALLATION,
-            Operating::Diagnosis => 0x10,
-            Operating::SegmentMinimum => 0x20,
-            Operating::SegmentMinimumOnObject => 0x21,
-            Operating::VerticalMinimum => 0x22,
-            Operating::VerticalMinimumOnObject => 0x23,
-            Operating::Means(_) => MEANS,
-            Operating::Range(_) => RANGE,
-            Operating::RangeMeans(..) => RANGE_MEANS,
-            Operating::RangeFields(_) => RANGE_FIELDS,
-            Operating::Partial => PARTIAL,
-            Operating::Reflectivities(_) => REFLECTIVITIES,
-            Operating::SegmentMinimumOfRange(_) => 0x2C,
-            Operating::Navigation => 0x2E,
-            Operating::TestPassword(_) => 0x30,
-            Operating::Reflectivity(_) => 0x50,
-        }
+    fn write(self, writer: Writer) -> Writer {
+        self.write_parameters(writer.byte(self.byte()))
     }
 }
 
-/// What an operating mode is, in words (Telegram listing 7.3).
+/// Returns the name of an operating mode (Telegram listing 7.3).
 pub fn name(mode: u8) -> &'static str {
     match mode {
         INSTALLATION => "installation",
@@ -142,7 +82,7 @@ pub fn name(mode: u8) -> &'static str {
     }
 }
 
-/// The mode that changes the line's rate to `baud`.
+/// Returns the mode that changes the rate of the line to `baud`.
 pub fn of_baud(baud: Baud) -> u8 {
     match baud {
         Baud::B38400 => 0x40,
@@ -152,16 +92,22 @@ pub fn of_baud(baud: Baud) -> u8 {
     }
 }
 
-/// The rate that a mode changes the line to.
-pub fn baud_of(mode: u8) -> Option<Baud> {
-    Baud::ALL.into_iter().find(|&baud| of_baud(baud) == mode)
+impl Parameter for Baud {
+    fn read(data: &[u8]) -> Option<(Baud, &[u8])> {
+        let (&mode, rest) = data.split_first()?;
+        Some((Baud::ALL.into_iter().find(|&baud| of_baud(baud) == mode)?, rest))
+    }
+
+    fn write(self, writer: Writer) -> Writer {
+        writer.byte(of_baud(self))
+    }
 }
 
 /// Operating mode: installation.
 pub const INSTALLATION: u8 = 0x00;
 /// Operating mode: all values, continuously.
 pub const STREAM: u8 = 0x24;
-/// Operating mode: values on request; so a sensor begins.
+/// Operating mode: values on request, as after power-on.
 pub const ON_REQUEST: u8 = 0x25;
 /// Operating mode: mean values.
 pub const MEANS: u8 = 0x26;

@@ -19,13 +19,13 @@ use crate::lms::variant::Baud;
 /// The rate of the line.
 #[derive(Clone, Debug)]
 pub(crate) struct LineRate {
-    baud: Baud,
+    pub(crate) baud: Baud,
     /// Whether the port does not have the rate yet.
-    is_changed: bool,
+    pub(crate) is_changed: bool,
     /// Whether the port has one rate and no other.
     is_fixed: bool,
     /// Rate to stream at.
-    target: Baud,
+    pub(crate) target: Baud,
     /// Rate to stream at if the line can carry it.
     wanted: Baud,
     /// Whether to keep to the wanted rate even if the line cannot carry it.
@@ -69,22 +69,6 @@ impl LineRate {
             fast_switches: FastSwitches::default(),
             trial: Trial::Done,
         }
-    }
-
-    /// Returns the rate.
-    pub(crate) fn baud(&self) -> Baud {
-        self.baud
-    }
-
-    /// Returns the rate to stream at.
-    pub(crate) fn target(&self) -> Baud {
-        self.target
-    }
-
-    /// Returns whether the port has to be set to another rate. Bytes that were read before arrived at the previous
-    /// rate.
-    pub(crate) fn is_changed(&self) -> bool {
-        self.is_changed
     }
 
     /// Returns the rate if the port has to be set to it.

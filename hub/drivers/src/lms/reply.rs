@@ -2,9 +2,9 @@
 //! is [`crate::lms::status::Condition`]'s affair, not this file's.
 
 use crate::lms::command as request;
-use crate::lms::command::Span;
+use crate::lms::command::{Parameter as _, Span};
 use crate::lms::configuration::factory;
-use crate::lms::measured::{MEASURED, Measured, RangeFields, Reflectivities, Reflectivity};
+use crate::lms::measured::{MEASURED, Measured, Rows};
 use crate::lms::status::Errors;
 use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
 use crate::lms::variant::{Mode, Unit, Variant};
@@ -65,7 +65,7 @@ pub enum Reply<'a> {
         resolution_cdeg: u16,
     },
     /// BEh: a sub-range with field values.
-    RangeFields(RangeFields<'a>),
+    RangeFields(Rows<'a>),
     /// BFh: mean values of a sub-range.
     RangeMeans {
         /// Of how many scans.
@@ -76,7 +76,7 @@ pub enum Reply<'a> {
         values: Measured<'a>,
     },
     /// C4h: ranges, and reflectivities of a sub-range; LMS S14.
-    Reflectivity(Reflectivity<'a>),
+    Reflectivity(Rows<'a>),
     /// E6h: to the change of the rate after power-on.
     PowerOnSet {
         /// The result; [`StatusReport::has_permanent_baud`] has the present state.
@@ -87,7 +87,7 @@ pub enum Reply<'a> {
     /// F4h.
     Configuration(Configuration<'a>),
     /// F5h: ranges and reflectivities.
-    Reflectivities(Reflectivities<'a>),
+    Reflectivities(Rows<'a>),
     /// F7h: to the change of the configuration.
     ConfigurationWritten {
         /// Whether it was changed.
@@ -144,8 +144,8 @@ impl<'a> Reply<'a> {
             },
             (MEANS, &[shots, ref rest @ ..]) => Reply::Means { shots, values: Measured::read(rest)? },
             (RANGE, data) => {
-                let (span, rest) = data.split_at_checked(Span::LEN)?;
-                Reply::Range { span: Span::read(span)?, values: Measured::read(rest)? }
+                let (span, rest) = Span::read(data)?;
+                Reply::Range { span, values: Measured::read(rest)? }
             }
             (TYPE, name) => Reply::Type(name.trim_ascii()),
             (VARIANT, &[done, a, b, c, d]) => Reply::Variant {
@@ -153,15 +153,15 @@ impl<'a> Reply<'a> {
                 angle_deg: u16::from_le_bytes([a, b]),
                 resolution_cdeg: u16::from_le_bytes([c, d]),
             },
-            (RANGE_FIELDS, data) => Reply::RangeFields(RangeFields::new(data)?),
+            (RANGE_FIELDS, data) => Reply::RangeFields(Rows::of_fields(data)?),
             (RANGE_MEANS, &[shots, ref rest @ ..]) => {
-                let (span, rest) = rest.split_at_checked(Span::LEN)?;
-                Reply::RangeMeans { shots, span: Span::read(span)?, values: Measured::read(rest)? }
+                let (span, rest) = Span::read(rest)?;
+                Reply::RangeMeans { shots, span, values: Measured::read(rest)? }
             }
-            (REFLECTIVITY, data) => Reply::Reflectivity(Reflectivity::new(data)?),
+            (REFLECTIVITY, data) => Reply::Reflectivity(Rows::of_reflectivity(data)?),
             (POWER_ON_SET, &[outcome, set]) => Reply::PowerOnSet { outcome, set },
             (CONFIGURATION, data) => Reply::Configuration(Configuration::new(data)?),
-            (REFLECTIVITIES, data) => Reply::Reflectivities(Reflectivities::new(data)?),
+            (REFLECTIVITIES, data) => Reply::Reflectivities(Rows::of_reflectivities(data)?),
             (CONFIGURATION_WRITTEN, &[outcome, ref rest @ ..]) => {
                 Reply::ConfigurationWritten { done: outcome == 1, configuration: Configuration::new(rest)? }
             }
@@ -194,12 +194,12 @@ impl<'a> Reply<'a> {
             Reply::Variant { done, angle_deg, resolution_cdeg } => {
                 writer.byte(u8::from(done)).word(angle_deg).word(resolution_cdeg)
             }
-            Reply::RangeFields(fields) => fields.write(writer)?,
             Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots)))?,
-            Reply::Reflectivity(view) => writer.reply_slice(view.bytes())?,
             Reply::PowerOnSet { outcome, set } => writer.byte(outcome).byte(set),
             Reply::Configuration(configuration) => writer.reply_slice(configuration.bytes())?,
-            Reply::Reflectivities(view) => writer.reply_slice(view.bytes())?,
+            Reply::RangeFields(rows) | Reply::Reflectivity(rows) | Reply::Reflectivities(rows) => {
+                writer.reply_slice(rows.bytes())?
+            }
             Reply::ConfigurationWritten { done, configuration } => {
                 writer.byte(u8::from(done)).reply_slice(configuration.bytes())?
             }

@@ -96,17 +96,17 @@ impl Session {
     /// Returns the number of switches to 500,000 baud in a row that the scanner acknowledged and that were followed by
     /// silence, at most 2. It outlives restarts of the scanner.
     pub fn silent_switches(&self) -> u8 {
-        self.dialogue.rate().silent_switches()
+        self.dialogue.rate.silent_switches()
     }
 
     /// Returns the rate of the line.
     pub fn baud(&self) -> Baud {
-        self.dialogue.rate().baud()
+        self.dialogue.rate.baud
     }
 
     /// Returns what the scanner has reported.
     pub fn sensor(&self) -> &Sensor {
-        self.dialogue.sensor()
+        &self.dialogue.sensor
     }
 
     /// Returns why the session does not stream.
@@ -135,7 +135,7 @@ impl Session {
         // A later read may show that bytes were older than their stamps. Those before them were older still, but their
         // stamps are published.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
-        let last = match due.and(self.rhythm.duration()) {
+        let last = match due.and(self.rhythm.duration) {
             Some(usual) => (first.at + usual).min(last.latest.unwrap_or(last.at)),
             None => last.at,
         };
@@ -168,7 +168,7 @@ impl Session {
         let (is_at_rate, is_line_damaged) = (self.is_at_rate(), self.damage.is_recent(self.now));
         self.dialogue.on_telegram(telegram, reply, is_line_damaged, first.at, self.now);
         let mode = self.sensor().mode_of_scans().filter(|_| is_at_rate).or(self.settings.mode);
-        let received = received(telegram, reply.as_ref(), mode, self.dialogue.rate().target(), span.offset);
+        let received = received(telegram, reply.as_ref(), mode, self.dialogue.rate.target, span.offset);
         let reasons = received.reasons | framed.reasons | if slow { suspect::SLOW } else { 0 };
         Received { first: first.at, last, estimated, reasons, ..received }
     }
@@ -202,8 +202,8 @@ impl Session {
 
     /// Returns whether the line has the rate of the settings, so that periods and durations are those of that rate.
     fn is_at_rate(&self) -> bool {
-        let rate = self.dialogue.rate();
-        !rate.is_changed() && rate.baud() == rate.target()
+        let rate = &self.dialogue.rate;
+        !rate.is_changed && rate.baud == rate.target
     }
 
     /// Returns whether bytes arrive at the pace of a line, unlike those of a recording or a network.
@@ -304,7 +304,7 @@ impl line::Session for Session {
         let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
         // A reply takes less time than a scan.
         let is_silent = self.dialogue.open().is_none();
-        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
+        begins && is_silent && self.rhythm.duration.is_some() && self.has_pace() && self.is_live()
     }
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
@@ -356,11 +356,11 @@ impl line::Session for Session {
             discarded: tally.discarded,
             buffered: self.framer.buffered() as u64,
             telegrams: tally.telegrams,
-            due: self.cadence.due(),
-            lost: self.cadence.lost(),
+            due: self.cadence.due,
+            lost: self.cadence.lost,
             damaged: self.damage.damaged(tally),
             rejected_checksum: tally.rejected[Reject::Crc as usize],
-            resyncs: self.dialogue.resyncs(),
+            resyncs: self.dialogue.resyncs,
             restarts: self.dialogue.restarts(),
             began_with_a_cut: self.cut,
         }
@@ -390,7 +390,7 @@ impl line::Session for Session {
 
     /// For a line that cannot carry 500,000 baud, it is the rate in use.
     fn known_rate(&self) -> Option<KnownRate> {
-        self.dialogue.rate().known()
+        self.dialogue.rate.known()
     }
 
     fn set_partial_reads(&mut self, count: u8) {
@@ -411,7 +411,7 @@ impl line::Session for Session {
             number: begun.offset,
             first: first.at.max(self.last_stamp),
             last: last.at.max(first.at).max(self.last_stamp),
-            period: nominal_period(scan.beams(), self.dialogue.rate().target().rate()),
+            period: nominal_period(scan.beams(), self.dialogue.rate.target.rate()),
             reasons: begun.reasons,
             bytes,
             ..scan
@@ -452,7 +452,7 @@ impl line::Session for Session {
                 _ => {}
             }
         }
-        Some(received(telegram, reply.as_ref(), mode, self.dialogue.rate().target(), 0))
+        Some(received(telegram, reply.as_ref(), mode, self.dialogue.rate.target, 0))
     }
 
     fn describe(&self, status: &mut Status) {

@@ -28,7 +28,7 @@ pub(crate) enum Step {
 /// settings, and to a stream.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Start {
-    step: Step,
+    pub(crate) step: Step,
     /// Number of stops that may still be sent.
     stops_left: u8,
     /// Steps once the scanner is at rest, at the rate to stream at.
@@ -48,11 +48,6 @@ impl Start {
         has_status: false,
         has_type: false,
     };
-
-    /// Returns the step whose reply is expected.
-    pub(crate) fn step(&self) -> Step {
-        self.step
-    }
 
     /// Returns the request of the step, and its number of tries.
     pub(crate) fn request(&self, baud: Baud, variant: Variant) -> (Request, u8) {

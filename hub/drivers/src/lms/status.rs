@@ -22,21 +22,6 @@ impl Condition {
         Severity::of_code(self.0 & 7)
     }
 
-    /// Whether the sensor calls itself an LMS type 6; else it is another or a special device.
-    pub fn is_type_6(self) -> bool {
-        self.0 >> 3 & 3 == 0b10
-    }
-
-    /// Whether the restart input is high.
-    pub fn restart_input(self) -> bool {
-        self.0 & 0x20 != 0
-    }
-
-    /// Whether the sensor finds its own values implausible.
-    pub fn is_implausible(self) -> bool {
-        self.0 & 0x40 != 0
-    }
-
     /// Whether the window is dirty.
     pub fn is_polluted(self) -> bool {
         self.0 & 0x80 != 0
@@ -50,9 +35,9 @@ impl fmt::Display for Condition {
             None => write!(f, "severity {}", self.0 & 7)?,
         }
         let flags = [
-            (!self.is_type_6(), "no LMS of type 6"),
-            (self.restart_input(), "restart input high"),
-            (self.is_implausible(), "implausible values"),
+            (self.0 >> 3 & 3 != 0b10, "no LMS of type 6"),
+            (self.0 & 0x20 != 0, "restart input high"),
+            (self.0 & 0x40 != 0, "implausible values"),
             (self.is_polluted(), "window polluted"),
         ];
         for (_, words) in flags.iter().filter(|(is_set, _)| *is_set) {
@@ -132,27 +117,14 @@ impl<'a> StatusReport<'a> {
         self.0[8] != 0
     }
 
-    /// What the eight channels of the pollution measurement see, and after them the four of the reference.
-    pub fn pollution(&self) -> [u16; 12] {
-        core::array::from_fn(|i| self.word(18 + 2 * i))
-    }
-
-    /// What they saw of a clean window.
-    pub fn pollution_calibration(&self) -> [u16; 12] {
-        core::array::from_fn(|i| self.word(42 + 2 * i))
-    }
-
     /// What the dirtiest channel of the window lets through, in percent of when it was clean; `None` if nobody measured
     /// that.
     pub fn window_percent(&self) -> Option<u16> {
-        let channels = self.pollution().into_iter().zip(self.pollution_calibration()).take(CHANNELS);
-        let percent = |(is, was): (u16, u16)| (u32::from(is) * 100).checked_div(u32::from(was));
-        channels.filter_map(percent).min().and_then(|percent| percent.try_into().ok())
-    }
-
-    /// Microseconds per 1/90 turn of the mirror; 148 is 13.32 ms a turn.
-    pub fn motor_us(&self) -> u16 {
-        self.word(66)
+        let percent = |channel| {
+            let (is, was) = (self.word(18 + 2 * channel), self.word(42 + 2 * channel));
+            (u32::from(is) * 100).checked_div(u32::from(was))
+        };
+        (0..CHANNELS).filter_map(percent).min().and_then(|percent| percent.try_into().ok())
     }
 
     /// Laser power in percent of what it should be; a real one told 156 to 161.
@@ -488,8 +460,8 @@ mod tests {
             assert_eq!((report.is_defective(), report.is_laser_on()), (false, true));
             assert_eq!((report.mode(), report.variant()), (Mode(1), Some(Variant::HALF)));
             assert_eq!((report.unit(), report.baud()), (Some(Unit::Cm), Some(baud)));
-            assert_eq!((report.motor_us(), report.has_permanent_baud(), report.address()), (148, false, 0));
-            assert_eq!((report.pollution(), report.laser_power_percent()), ([0; 12], 0));
+            assert_eq!((report.word(66), report.has_permanent_baud(), report.address()), (148, false, 0));
+            assert_eq!((&report.bytes()[18..42], report.laser_power_percent()), (&[0; 24][..], 0));
         }
         assert_eq!(StatusReport::new(&[0; 151]), None);
     }

@@ -91,21 +91,12 @@ impl Unit {
 
     /// The unit of code 0, 1 or 2, as in bits 14 and 15 of a count word and in byte 6 of the configuration.
     pub fn of_code(code: u8) -> Option<Unit> {
-        match code {
-            0 => Some(Unit::Cm),
-            1 => Some(Unit::Mm),
-            2 => Some(Unit::Dm),
-            _ => None,
-        }
+        [Unit::Cm, Unit::Mm, Unit::Dm].get(usize::from(code)).copied()
     }
 
     /// Its code.
     pub fn code(self) -> u8 {
-        match self {
-            Unit::Cm => 0,
-            Unit::Mm => 1,
-            Unit::Dm => 2,
-        }
+        self as u8
     }
 }
 

@@ -3,8 +3,8 @@
 //! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. So such packets are accepted
 //! after a run of them with angles near each other, and each only if another one follows it.
 
-use crate::line::framing::{Format, Verdict, judge};
-use crate::line::{Buffer, Tally, suspect};
+use crate::line::framing::{Format, Verdict};
+use crate::line::{Buffer, suspect};
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::rplidar::packet::Kind;
@@ -57,12 +57,10 @@ pub(crate) struct Span {
 /// The framer with its buffer.
 #[derive(Clone, Debug)]
 pub(crate) struct Framer {
-    buffer: Buffer<CAPACITY>,
+    pub(crate) buffer: Buffer<CAPACITY>,
     expect: Expect,
     /// Whether the next packet must begin at the end of the last one.
     is_locked: bool,
-    is_held: bool,
-    is_released: bool,
     /// Number of bytes discarded since the last packet.
     skipped: u32,
     /// Number of printable ones in a row, the last of them, and whether they contain [`NAME`].
@@ -99,11 +97,9 @@ enum Step {
 impl Framer {
     pub(crate) fn new(expect: Expect) -> Self {
         Framer {
-            buffer: Buffer::default(),
+            buffer: Buffer::new(HOLD),
             expect,
             is_locked: false,
-            is_held: false,
-            is_released: false,
             skipped: 0,
             text: 0,
             last_text: [0; NAME.len()],
@@ -118,20 +114,9 @@ impl Framer {
         (self.is_locked, self.skipped) = (false, 0);
     }
 
-    /// Returns the space for the next bytes. Never empty after [`Framer::advance`] returned `None`.
-    pub(crate) fn spare(&mut self) -> &mut [u8] {
-        self.buffer.spare()
-    }
-
-    /// Adds the first `len` bytes of [`Framer::spare`].
-    pub(crate) fn commit(&mut self, len: usize) {
-        self.buffer.commit(len);
-        self.is_released &= len == 0;
-    }
-
     /// Returns what is next, at most `most` packets. `None` until more bytes arrive.
     pub(crate) fn advance(&mut self, most: usize) -> Option<Found> {
-        self.is_held = false;
+        self.buffer.begin_check();
         loop {
             let open = self.buffer.open();
             if open.is_empty() {
@@ -182,21 +167,10 @@ impl Framer {
         (span.len, span.packets) = (packets * len, packets);
     }
 
-    /// Returns how long the line must be idle until [`Framer::release`] releases a packet that is held back. `None` if
-    /// there is none.
-    pub(crate) fn hold(&self) -> Option<Nanos> {
-        self.is_held.then_some(HOLD)
-    }
-
-    /// Handles a read that found nothing. No byte has arrived for `idle`.
-    pub(crate) fn release(&mut self, idle: Nanos) {
-        self.is_released |= self.is_held && idle >= HOLD;
-    }
-
     /// Discards all open bytes.
     pub(crate) fn clear(&mut self) {
         self.buffer.clear();
-        (self.is_held, self.is_released, self.text) = (false, false, 0);
+        self.text = 0;
     }
 
     /// Returns the kind of the expected packets.
@@ -212,14 +186,6 @@ impl Framer {
     /// Returns the number of bytes that were discarded since the last packet.
     pub(crate) fn skipped(&self) -> u32 {
         self.skipped
-    }
-
-    pub(crate) fn tally(&self) -> &Tally {
-        self.buffer.tally()
-    }
-
-    pub(crate) fn buffered(&self) -> usize {
-        self.buffer.open().len()
     }
 
     /// Returns whether the open bytes follow a packet and may be the next one. Then they are, even if they look like a response.
@@ -239,14 +205,10 @@ impl Framer {
             Expect::Packets(kind) => {
                 let mut packets = 0;
                 while packets < most {
-                    match judge(&kind, &self.buffer.open()[packets * kind.bytes()..], self.is_released) {
+                    match self.buffer.judge(&kind, packets * kind.bytes()) {
                         Verdict::Packet => packets += 1,
                         _ if packets > 0 => break,
-                        Verdict::Open => return Step::Wait,
-                        Verdict::Held => {
-                            self.is_held = true;
-                            return Step::Wait;
-                        }
+                        Verdict::Open | Verdict::Held => return Step::Wait,
                         Verdict::Nothing(rejected) => {
                             if rejected.is_some() {
                                 self.buffer.reject_checksum();

@@ -9,10 +9,9 @@
 use scanhub_schema::{MILLIS, Nanos};
 
 use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Answer, Request, key};
-use crate::rplidar::request::{Health, Info};
-use crate::rplidar::session::{DRAIN, FEATURES, Trouble};
-use crate::rplidar::{Mode, Model, Motor};
+use crate::rplidar::request::{Answer, Health, Info, Request, key};
+use crate::rplidar::session::{DRAIN, Trouble};
+use crate::rplidar::{FEATURES, Mode, Model, Motor};
 use crate::settings::Settings;
 
 /// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place
@@ -109,17 +108,17 @@ pub(crate) enum Next {
 #[derive(Clone, Debug)]
 pub(crate) struct Handshake {
     settings: Settings,
-    info: Option<Info>,
-    health: Option<Health>,
+    pub(crate) info: Option<Info>,
+    pub(crate) health: Option<Health>,
     /// Whether a scanner that reported an error was already restarted.
     was_reset: bool,
     /// Whether an accessory board controls the motor, by its duty cycle.
     has_board: bool,
-    modes: ScanModes,
+    pub(crate) modes: ScanModes,
     /// The mode in use, if scanhub knows it.
-    mode: Option<Mode>,
+    pub(crate) mode: Option<Mode>,
     /// The mode of the settings, if the scanner cannot use it.
-    unavailable_mode: Option<Mode>,
+    pub(crate) unavailable_mode: Option<Mode>,
     /// In a recording: place of the last mode in a response to the recorded program, and the key of that response.
     recorded: (u8, u8),
 }
@@ -139,29 +138,9 @@ impl Handshake {
         }
     }
 
-    /// Returns the identity that the scanner reported.
-    pub(crate) fn info(&self) -> Option<Info> {
-        self.info
-    }
-
-    /// Returns the health that the scanner reported.
-    pub(crate) fn health(&self) -> Option<Health> {
-        self.health
-    }
-
     /// Returns the model, once it is known.
     pub(crate) fn model(&self) -> Option<Model> {
         self.info.and_then(|info| info.model()).or(Model::of(&self.settings))
-    }
-
-    /// Returns the scan modes that the scanner reported.
-    pub(crate) fn modes(&self) -> &ScanModes {
-        &self.modes
-    }
-
-    /// Returns the scan mode in use, if scanhub knows it.
-    pub(crate) fn mode(&self) -> Option<Mode> {
-        self.mode
     }
 
     /// Handles the descriptor of a stream with packets of `kind`. In a recording, the mode is the only reported one with such
@@ -170,11 +149,6 @@ impl Handshake {
         if self.settings.listen_only && self.settings.mode.is_none() {
             self.mode = self.modes.only_of(kind);
         }
-    }
-
-    /// Returns the mode of the settings, if the scanner cannot use it.
-    pub(crate) fn unavailable_mode(&self) -> Option<Mode> {
-        self.unavailable_mode
     }
 
     /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest
@@ -520,11 +494,11 @@ const DUTY: u16 = 660;
 /// The rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RateSearch {
-    baud: u32,
+    pub(crate) baud: u32,
     /// Whether the port has this rate and no other, or nothing can be sent.
     is_fixed: bool,
     /// Whether the port does not have the rate yet.
-    is_changed: bool,
+    pub(crate) is_changed: bool,
     /// Time since which no response has arrived, and the number of bytes read by then.
     quiet_since: Option<(Nanos, u64)>,
     /// Rate of the last stream, until a boot message is received or the session restarts the scanner.
@@ -548,19 +522,9 @@ impl RateSearch {
         self.baud = baud;
     }
 
-    /// Returns the rate in bits per second.
-    pub(crate) fn baud(&self) -> u32 {
-        self.baud
-    }
-
     /// Returns the rate if the port has to be set to it.
     pub(crate) fn take_change(&mut self) -> Option<u32> {
         core::mem::take(&mut self.is_changed).then_some(self.baud)
-    }
-
-    /// Returns whether the port has to be set to another rate.
-    pub(crate) fn is_changed(&self) -> bool {
-        self.is_changed
     }
 
     /// Ends the search, because the scanner has responded.

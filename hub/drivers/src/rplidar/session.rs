@@ -6,23 +6,19 @@
 
 use core::fmt;
 
-use scanhub_schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
+use scanhub_schema::{MILLIS, Nanos, line_time};
 
-use crate::line::family::{self, Features, table};
 use crate::line::{
     self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
-    StreamCounters, Tally, TurnCounts, Watchdog,
+    StreamCounters, Tally, TurnCounts, Watchdog, family,
 };
 use crate::rplidar::framer::{Expect, Found, Framer, Span};
-use crate::rplidar::handshake::RateSearch;
-use crate::rplidar::handshake::{Handshake, Next, Query};
+use crate::rplidar::handshake::{Handshake, Next, Query, RateSearch};
 use crate::rplidar::packet::Kind;
-use crate::rplidar::request::StreamHead;
-use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
-use crate::rplidar::request::{Health, Info};
-use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
-use crate::rplidar::{Mode, Model};
-use crate::settings::{Key, Refusal, Settings, SettingsRequest};
+use crate::rplidar::request::{Answer, Head, Health, Info, Request, RequestQueue, StreamHead};
+use crate::rplidar::stream::{Line, Stream};
+use crate::rplidar::{Mode, Model, described};
+use crate::settings::Settings;
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
@@ -97,17 +93,12 @@ impl Session {
 
     /// Returns the identity that the scanner reported.
     pub fn info(&self) -> Option<Info> {
-        self.handshake.info()
+        self.handshake.info
     }
 
     /// Returns the health that the scanner reported.
     pub fn health(&self) -> Option<Health> {
-        self.handshake.health()
-    }
-
-    /// Returns the number of beams of a scan, once the model is known.
-    pub fn beams(&self) -> Option<usize> {
-        self.stream.beams()
+        self.handshake.health
     }
 
     /// Returns the points that the scanner measures per second, once they are known.
@@ -117,7 +108,7 @@ impl Session {
 
     /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
-        self.framer.tally()
+        self.framer.buffer.tally()
     }
 
     /// Returns the numbers of revolutions by kind.
@@ -200,7 +191,7 @@ impl Session {
     fn answered(&mut self, answer: Answer, span: Span) {
         let query = if let Phase::Querying { query, .. } = self.phase { Some(query) } else { None };
         let data = &self.framer.bytes(span)[Head::LEN..];
-        let next = self.handshake.answered(query, answer, data, self.rate.baud());
+        let next = self.handshake.answered(query, answer, data, self.rate.baud);
         self.proceed(next);
     }
 
@@ -215,7 +206,7 @@ impl Session {
             Query::Info => self.search_on(),
             _ if attempts == 0 || is_damaged => self.query(query, attempts + 1),
             _ => {
-                let next = self.handshake.unanswered(query, self.rate.baud());
+                let next = self.handshake.unanswered(query, self.rate.baud);
                 self.proceed(next);
             }
         }
@@ -260,7 +251,7 @@ impl Session {
 
     /// Tries the next rate, and updates the time in the trouble.
     fn search_on(&mut self) {
-        let since = self.rate.advance(self.now, self.framer.tally().read);
+        let since = self.rate.advance(self.now, self.framer.buffer.tally().read);
         self.complain(since);
         self.stop(0);
     }
@@ -320,7 +311,7 @@ impl Session {
                 let mut watchdog = self.continue_stream();
                 watchdog.await_spin_up(self.now + SPIN_UP);
                 self.phase = Phase::Streaming(watchdog);
-                self.counters.await_revolution(self.framer.tally());
+                self.counters.await_revolution(self.framer.buffer.tally());
             }
             Phase::Paused { .. } => self.framer.expect(Expect::Nothing),
             Phase::Draining { .. } | Phase::Booting { .. } | Phase::Unwell { .. } => {
@@ -335,10 +326,10 @@ impl Session {
         if let Phase::Streaming(known) = self.phase {
             watchdog = known;
             watchdog.note_packets(self.now);
-            self.counters.continue_stream(self.framer.tally());
+            self.counters.continue_stream(self.framer.buffer.tally());
         } else {
             self.trouble = None;
-            self.counters.begin_stream(self.framer.tally());
+            self.counters.begin_stream(self.framer.buffer.tally());
         }
         self.phase = Phase::Streaming(watchdog);
         self.rate.note_stream();
@@ -355,13 +346,13 @@ impl Session {
     fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_> {
         self.continue_stream();
         span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
-        let baud = self.rate.baud();
+        let baud = self.rate.baud;
         let pace = (!self.settings.fixed_rate).then_some(baud);
         let line = Line { arrivals: self.reads.arrivals(), baud, pace };
         let mut stamps = None;
-        if self.stream.measure(kind, span, line, self.handshake.modes()) {
+        if self.stream.measure(kind, span, line, &self.handshake.modes) {
             stamps = self.stream.place(kind, &mut span, &mut self.framer, line, &self.handshake);
-            self.counters.note_packets(self.framer.tally(), span.packets);
+            self.counters.note_packets(self.framer.buffer.tally(), span.packets);
         }
         let packet_time = line_time(kind.bytes(), baud);
         let latest = line.arrivals.latest(span.offset + span.len as u64 - 1, pace);
@@ -405,7 +396,7 @@ impl Session {
         if let Phase::Streaming(watchdog) = &mut self.phase {
             watchdog.note_revolution(self.now);
         }
-        self.counters.await_revolution(self.framer.tally());
+        self.counters.await_revolution(self.framer.buffer.tally());
         self.stream.scan(closed, &self.reads, self.now)
     }
 
@@ -436,7 +427,7 @@ impl Session {
                 self.begin(State::Silent);
             }
             Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(now) => {
-                let is_damaged = self.counters.is_mostly_damaged(self.framer.tally());
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.buffer.tally());
                 self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
             }
             _ => {}
@@ -461,7 +452,7 @@ impl Session {
 
 impl line::Protocol for Session {
     fn spare(&mut self) -> &mut [u8] {
-        let spare = self.framer.spare();
+        let spare = self.framer.buffer.spare();
         self.reads.offer(spare.len());
         spare
     }
@@ -470,7 +461,7 @@ impl line::Protocol for Session {
         self.now = now;
         self.reads.note(now, len, line::Session::state(self) == State::Streaming);
         if len > 0 {
-            self.framer.commit(len);
+            self.framer.buffer.commit(len);
             if let Phase::Draining { until, .. } = &mut self.phase {
                 *until = now + QUIET;
             }
@@ -479,7 +470,7 @@ impl line::Protocol for Session {
 
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
-        self.framer.release(now.saturating_sub(self.reads.last_byte()));
+        self.framer.buffer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
     fn transmitted(&mut self, now: Nanos) {
@@ -521,10 +512,10 @@ impl line::Protocol for Session {
             }
         }
         self.expire();
-        if self.change_dtr.is_some() || self.rate.is_changed() || !self.requests.bytes().is_empty() {
+        if self.change_dtr.is_some() || self.rate.is_changed || !self.requests.bytes().is_empty() {
             return self.poll_output();
         }
-        self.reads.wait(self.now, self.deadline(), self.framer.hold())
+        self.reads.wait(self.now, self.deadline(), self.framer.buffer.hold())
     }
 }
 
@@ -576,7 +567,7 @@ impl line::Session for Session {
 
     fn trouble(&self) -> Option<Trouble> {
         let is_paused = matches!(self.phase, Phase::Paused { .. });
-        let no_mode = self.handshake.unavailable_mode().map(Trouble::NoMode);
+        let no_mode = self.handshake.unavailable_mode.map(Trouble::NoMode);
         let warning =
             self.health().filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
         self.trouble.or(no_mode).or(warning).filter(|_| !is_paused)
@@ -587,11 +578,11 @@ impl line::Session for Session {
     }
 
     fn rate(&self) -> u32 {
-        self.rate.baud()
+        self.rate.baud
     }
 
     fn account(&self) -> Account {
-        let (tally, buffered) = (self.framer.tally(), self.framer.buffered());
+        let (tally, buffered) = (self.framer.buffer.tally(), self.framer.buffer.open().len());
         self.counters.account(tally, buffered, self.stream.came_and_lost())
     }
 
@@ -600,7 +591,7 @@ impl line::Session for Session {
     }
 
     fn beams(&self) -> Option<usize> {
-        self.beams()
+        self.stream.beams
     }
 
     fn partial_scan(&self) -> Option<RawScan<'_>> {
@@ -624,7 +615,7 @@ impl line::Session for Session {
 
     fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
         let Some(kind) = self.framer.kind() else { return Vec::new() };
-        let (model, modes) = (self.model(), self.handshake.modes());
+        let (model, modes) = (self.model(), &self.handshake.modes);
         if self.is_announced && self.info().is_some() && modes.is_unambiguous(kind) {
             return Vec::new();
         }
@@ -633,7 +624,7 @@ impl line::Session for Session {
         let is_it = |mode: &Mode| sample_us.is_some_and(|us| modes.has(*mode, kind, us as f32));
         let head = StreamHead {
             info: self.info().or_else(|| Info::of_status(model, reported)),
-            mode: self.handshake.mode().or(of_status.filter(is_it)),
+            mode: self.handshake.mode.or(of_status.filter(is_it)),
             sample_us,
             kind,
         };
@@ -641,14 +632,14 @@ impl line::Session for Session {
     }
 
     fn write_details(&self, text: &mut dyn fmt::Write) {
-        let _ = self.handshake.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
+        let _ = self.handshake.mode.map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
         if let Some(Info { firmware: (major, minor), .. }) = self.info() {
             let _ = write!(text, " {major}.{minor:02}");
         }
     }
 
     fn scanner_time(&self) -> Option<Nanos> {
-        self.stream.scanner_time()
+        self.stream.scanner_time
     }
 
     fn mark_suspect(&mut self, reasons: u8) {
@@ -685,32 +676,6 @@ impl line::Session for Session {
             },
         })
     }
-}
-
-/// Models and settings of the family.
-pub const FEATURES: Features = Features {
-    models: &MODELS,
-    // Enough for all models but the S2 and the S3.
-    auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
-    modes: &MODES,
-    keys: &[Key::ModeName, Key::Idle],
-    can_rest: true,
-    speaks_unasked: false,
-    has_whole_telegrams: false,
-    has_inquiry: false,
-    contents: Contents::TURNING,
-    max_telegram: MAX_SAMPLE_LEN,
-};
-
-/// Returns the settings that `request` has for an RPLIDAR.
-pub(crate) fn check(request: &SettingsRequest) -> Result<Settings, Refusal> {
-    request.check_models(Family::Rplidar, &FEATURES)
-}
-
-/// Returns the head of a scan on a grid of as many beams as there is space for.
-pub(crate) fn scan_heads(settings: &Settings) -> Vec<ScanHead> {
-    let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
-    vec![ScanHead::turning(Family::Rplidar, beams)]
 }
 
 /// Reason why a session does not stream as it should.
@@ -765,17 +730,6 @@ impl fmt::Display for Trouble {
         }
     }
 }
-
-/// Describes a model for the configuration.
-const fn described(model: Model) -> family::Model {
-    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
-}
-
-/// All models, described for the configuration.
-const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
-
-/// Names of all modes.
-const MODES: [&str; Mode::ALL.len()] = table!(Mode::ALL, Mode::name);
 
 /// A line without a byte for this time after the stop request is quiet.
 const QUIET: Nanos = 15 * MILLIS;

@@ -30,9 +30,9 @@ pub(crate) struct Stream {
     point_time: PointTime,
     revolutions: Revolutions,
     /// Number of beams, once it is known.
-    beams: Option<usize>,
+    pub(crate) beams: Option<usize>,
     /// Time of the last packet, by the scanner's clock.
-    scanner_time: Option<Nanos>,
+    pub(crate) scanner_time: Option<Nanos>,
 }
 
 impl Stream {
@@ -69,19 +69,9 @@ impl Stream {
         self.point_time.ns = sample_us.map(|us| f64::from(us) * 1e3);
     }
 
-    /// Returns the number of beams of a scan, once it is known.
-    pub(crate) fn beams(&self) -> Option<usize> {
-        self.beams
-    }
-
     /// Returns the points that the scanner measures per second, once they are known.
     pub(crate) fn points_per_second(&self) -> Option<f32> {
         self.point_time.ns.map(|ns| (1e9 / ns) as f32)
-    }
-
-    /// Returns the time of the last packet, by the scanner's clock.
-    pub(crate) fn scanner_time(&self) -> Option<Nanos> {
-        self.scanner_time
     }
 
     /// Returns the numbers of received and lost packets.
@@ -223,7 +213,7 @@ impl Stream {
         let follows = listen_only || is_found && named.is_none();
         let mode_us = match mode {
             Some(_) => Some(point_us),
-            None => handshake.modes().nearest_us(kind, point_us).filter(|_| follows),
+            None => handshake.modes.nearest_us(kind, point_us).filter(|_| follows),
         };
         mode_us.map_or(model.beams(), |us| model.beams_in_mode(1e6 / us))
     }

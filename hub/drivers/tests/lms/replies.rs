@@ -3,7 +3,7 @@
 
 use scanhub_drivers::lms::command::Span;
 use scanhub_drivers::lms::configuration::Configuration;
-use scanhub_drivers::lms::measured::{self, Frame, Measured, RangeFields};
+use scanhub_drivers::lms::measured::{self, Frame, Measured, Rows};
 use scanhub_drivers::lms::reply::{self, Reply};
 use scanhub_drivers::lms::status::{Condition, Errors};
 use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
@@ -159,6 +159,6 @@ fn what_does_not_fit_is_no_reply() {
     assert!(Reply::Range { span, values }.encode(0, 0x10).is_none());
     assert!(Reply::RangeMeans { shots: 2, span, values }.encode(0, 0x10).is_none());
     let data = [&[1, 0, 101, 0, 101, 0][..], &[0; 8 * 101]].concat();
-    let fields = RangeFields::new(&data).expect("is one");
+    let fields = Rows::of_fields(&data).expect("is one");
     assert!(Reply::RangeFields(fields).encode(0, 0x10).is_none());
 }
