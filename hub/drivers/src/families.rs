@@ -81,7 +81,7 @@ families! {
     Rplidar rplidar,
 }
 
-/// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine them. They have
+/// Returns the possible scan heads of a scanner of `family`, as far as `settings` and the family determine them. They have
 /// the same number of beams, at most the maximum. A revolution has as many beams as there is space for.
 pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
     match family {

@@ -52,13 +52,13 @@ named! {
         Stl19p "stl19p",
         /// STL27L.
         Stl27l "stl27l",
-        /// LD14P, whose head turns slower.
+        /// LD14P, whose head rotates more slowly.
         Ld14p "ld14p",
     }
 }
 
 impl Model {
-    /// The model of this name.
+    /// Returns the model called `name`.
     pub fn named(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
     }
@@ -68,7 +68,7 @@ impl Model {
         settings.model.and_then(Model::named)
     }
 
-    /// The rate at which it speaks, in bits per second.
+    /// Returns the rate of its line, in bits per second.
     pub const fn baud(self) -> u32 {
         match self {
             Model::Stl27l => 921_600,
@@ -76,7 +76,7 @@ impl Model {
         }
     }
 
-    /// Points that it measures in a second, whatever the speed of its head.
+    /// Returns the number of points that it measures per second, at any speed of its head.
     pub const fn points_per_second(self) -> u32 {
         match self {
             Model::Stl27l => 21_600,
@@ -85,7 +85,7 @@ impl Model {
         }
     }
 
-    /// Turns in a second, as it comes out of its box.
+    /// Returns the number of revolutions per second of a new scanner.
     pub const fn turns_per_second(self) -> u32 {
         match self {
             Model::Ld14p => 6,
@@ -93,7 +93,7 @@ impl Model {
         }
     }
 
-    /// Beams of a turn unless something else is asked for: chosen by measurement (docs/scanners.md).
+    /// Returns the default number of beams, which was chosen by measurement (docs/scanners.md).
     pub const fn beams(self) -> usize {
         match self {
             Model::Stl27l => 2_160,
@@ -102,7 +102,7 @@ impl Model {
         }
     }
 
-    /// The model that measures so many points in a second; of those that cannot be told apart, the best known one.
+    /// Returns the model that measures `points_per_second`. Of models that cannot be distinguished, it is the best known one.
     pub(crate) fn of_point_rate(points_per_second: f32) -> Model {
         match points_per_second {
             rate if rate > 10_000.0 => Model::Stl27l,

@@ -1,6 +1,5 @@
-//! The one kind of packet that the scanners send: 47 bytes with 12 points, in both directions (source: the manuals of LD06
-//! and LD19, "data packet format"), and the framer that finds packets in a stream of bytes of which some are missing. The
-//! framer never discards an intact packet.
+//! Packets of the scanners, which all have 47 bytes and 12 points, in both directions (source: the manuals of LD06 and LD19,
+//! "data packet format"). The framer finds them in a stream that may lack bytes, and never discards an intact one.
 
 use scanhub_schema::{MILLIS, Nanos};
 
@@ -160,11 +159,11 @@ const END: usize = FIRST_POINT + 3 * POINTS;
 /// Radians in a hundredth of a degree.
 const RADIANS: f32 = core::f32::consts::PI / 18_000.0;
 
-/// Packets without anything between them, in the framer's buffer until the next bytes come.
+/// Packets without anything between them, in the framer's buffer until the next bytes are committed.
 #[derive(Clone, Copy, Debug)]
 pub struct Span {
     at: usize,
-    /// How many.
+    /// Number of packets.
     pub packets: usize,
     /// Number of the first byte among all bytes committed, from 0.
     pub offset: u64,
@@ -206,7 +205,7 @@ impl line::framing::Format for Format {
 }
 
 impl Framer {
-    /// The next packets, `most` at most; `None` until more bytes come.
+    /// Returns the next packets, at most `most`. `None` until more bytes arrive.
     pub fn advance(&mut self, most: usize) -> Option<Span> {
         self.buffer.begin_check();
         loop {
@@ -226,7 +225,7 @@ impl Framer {
         Some(Span { at, packets, offset, reasons: if is_damaged { suspect::NEIGHBOUR } else { 0 } })
     }
 
-    /// The bytes at a span that [`Framer::advance`] answered last.
+    /// Returns the bytes of the span that [`Framer::advance`] returned last.
     pub fn bytes(&self, span: Span) -> &[u8] {
         self.buffer.taken(span.at, span.packets * LEN)
     }
@@ -237,7 +236,7 @@ impl Framer {
         self.damage = false;
     }
 
-    /// Gives up the first open byte and all behind it up to the next that a packet may begin with.
+    /// Discards the first open byte, and those after it up to the next one that may begin a packet.
     fn discard(&mut self, rejected: Option<Reject>) {
         if rejected == Some(Reject::Checksum) {
             self.buffer.reject_checksum();
@@ -249,9 +248,9 @@ impl Framer {
     }
 }
 
-/// What a tty keeps for a reader who is late, and a piece of a packet.
+/// Capacity of a tty for a late reader, and a part of a packet.
 const CAPACITY: usize = 4_096 + 2 * LEN;
-/// A packet takes 2.04 ms at 230,400 baud; after so long without a byte none is under way.
+/// A packet takes 2.04 ms at 230,400 baud. After this time without a byte, none is in flight.
 const HOLD: Nanos = 4 * MILLIS;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What a family declares: the models and settings that a configuration can name, and how the search recognizes one of its
+//! Declarations of a family: the models and settings that a configuration can name, and how the search recognizes one of its
 //! scanners on a line. [`crate::search`] runs the steps of an [`Approach`], and passes the bytes to a [`Probe`].
 
 use core::fmt;

@@ -1,4 +1,4 @@
-//! Finds telegrams in a stream of bytes of which some are missing, and never discards an intact one.
+//! Finds telegrams in a stream that may lack bytes, and never discards an intact one.
 //!
 //! A parser that collects a damaged telegram to its announced length includes the beginning of the next one. So no byte is
 //! discarded here before it was examined: every position with an acceptable header is a *candidate*, and the first

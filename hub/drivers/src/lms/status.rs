@@ -17,12 +17,12 @@ impl Condition {
     /// A healthy LMS type 6.
     pub const OK: Condition = Condition(0x10);
 
-    /// How bad it is; `None` for codes without a meaning.
+    /// Returns the severity. `None` for codes without a meaning.
     pub fn severity(self) -> Option<Severity> {
         Severity::of_code(self.0 & 7)
     }
 
-    /// Whether the window is dirty.
+    /// Returns whether the window is dirty.
     pub fn is_polluted(self) -> bool {
         self.0 & 0x80 != 0
     }
@@ -47,7 +47,7 @@ impl fmt::Display for Condition {
     }
 }
 
-/// How bad a condition or an error is.
+/// Severity of a condition or an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
     /// Nothing to say.
@@ -56,26 +56,26 @@ pub enum Severity {
     Info,
     /// The sensor works, for now.
     Warning,
-    /// It does not work right.
+    /// The scanner does not work correctly.
     Error,
-    /// It does not work.
+    /// The scanner does not work.
     Fatal,
 }
 
 impl Severity {
-    /// The severity of code 0 to 4.
+    /// Returns the severity with code 0 to 4.
     pub fn of_code(code: u8) -> Option<Severity> {
         [Severity::Ok, Severity::Info, Severity::Warning, Severity::Error, Severity::Fatal]
             .get(usize::from(code))
             .copied()
     }
 
-    /// Its code.
+    /// Returns its code.
     pub fn code(self) -> u8 {
         self as u8
     }
 
-    /// In a word.
+    /// Returns its name.
     pub fn name(self) -> &'static str {
         match self {
             Severity::Ok => "ok",
@@ -326,7 +326,7 @@ pub const LEN: usize = 152;
 pub struct Errors<'a>(&'a [u8]);
 
 impl<'a> Errors<'a> {
-    /// The pairs that `bytes` are; `None` if one is cut.
+    /// Creates the view of the pairs in `bytes`. `None` if the last one is not complete.
     pub fn new(bytes: &'a [u8]) -> Option<Errors<'a>> {
         bytes.len().is_multiple_of(2).then_some(Errors(bytes))
     }
@@ -336,7 +336,7 @@ impl<'a> Errors<'a> {
         self.0
     }
 
-    /// In the order in which the sensor tells them.
+    /// Returns the errors in the order of the reply.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = Fault> + Clone + 'a {
         self.0.chunks_exact(2).map(|pair| Fault { kind: pair[0], number: pair[1] })
     }
