@@ -1,5 +1,6 @@
-//! The map of a scanner that moves: beside a slow version without a square that scrolls, in drives with truth, and with
-//! places that say nothing.
+//! The map of a scanner that moves, against a slow version with a square that does not scroll, in drives with truth, and with
+//! places without information. Lines, motion and the map of a lifted robot, with few returns or with a clock that jumps: no
+//! panic, and no result that is more certain than it may be.
 
 mod drives;
 
@@ -7,22 +8,24 @@ use std::collections::{HashMap, HashSet};
 
 use drives::Drive;
 use fastrand::Rng;
-use scanhub_preprocess::background::{Class, Method, Model, Settings};
-use scanhub_preprocess::motion::{self, MotionEstimator, Rigid};
+use scanhub_preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
+use scanhub_preprocess::lines::LineFinder;
+use scanhub_preprocess::motion::{MotionEstimator, Rigid};
 use scanhub_preprocess::velocity::Velocity;
-use scanhub_schema::{Background, Foreground, Motion, MotionMethod, Pose, Scan};
+use scanhub_preprocess::{lines, motion};
+use scanhub_schema::{Background, Foreground, Lines, Motion, MotionMethod, Pose, Scan};
 
 const SETTINGS: Settings = Settings {
     method: Method::Moving,
     threshold_mm: None,
     candidate_mm: None,
     scans: Some(100),
-    candidate: scanhub_preprocess::background::Candidate::First,
-    start: scanhub_preprocess::background::Start::Empty,
+    candidate: Candidate::First,
+    start: Start::Empty,
     no_return_is_far: None,
 };
 
-/// What is said of a robot that is known to be at `place`.
+/// Returns the motion of a robot at `place`.
 fn at(place: &Rigid, is_first: bool) -> Motion {
     let method = if is_first { MotionMethod::First } else { MotionMethod::Both };
     Motion { x_m: place.x, y_m: place.y, yaw_rad: place.yaw, method: method as u8, ..Motion::default() }
@@ -252,4 +255,136 @@ fn any_place_and_any_scan_are_taken() {
         model.show(&mut shown);
         assert!(usize::from(out.beams) <= count);
     }
+}
+
+/// Ten seconds of an LMS. The default depends on the time of a scan.
+const TEN_SECONDS: Settings = Settings { scans: Some(375), ..SETTINGS };
+
+/// All results of a scan.
+#[derive(PartialEq)]
+struct Said {
+    lines: Lines,
+    motion: Motion,
+    classes: Vec<Class>,
+    foreground: usize,
+}
+
+/// Returns the results of all scans, in the order of the hub.
+fn follow(scans: &[Box<Scan>]) -> Vec<Said> {
+    let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
+    let mut finder = LineFinder::new(Pose::default(), lines::Settings::default(), beams);
+    let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), beams);
+    let mut model = Model::new(TEN_SECONDS, beams);
+    let mut out = Foreground::of(beams);
+    let say = |(number, scan): (usize, &Scan)| {
+        let (mut lines, mut motion) = (Lines::default(), Motion::default());
+        finder.update(scan, &mut lines);
+        estimator.update(scan, drives::stamp_ns(number), 0, &mut motion);
+        model.follow(&Pose::default(), &motion, &estimator.velocity());
+        model.update(scan, &mut out);
+        let classes = model.classes().to_vec();
+        Said { lines, motion, classes, foreground: usize::from(out.beams) }
+    };
+    scans.iter().map(|scan| &**scan).enumerate().map(say).collect()
+}
+
+/// Returns the largest error of the step's three numbers, in reported standard deviations.
+fn deviations(truth: &Rigid, motion: &Motion) -> f64 {
+    let off = [
+        f64::from(motion.dx_m) - truth.x,
+        f64::from(motion.dy_m) - truth.y,
+        f64::from(motion.dyaw_rad) - truth.yaw,
+    ];
+    let of = |(k, off): (usize, f64)| off.abs() / f64::from(motion.covariance[4 * k]).sqrt();
+    off.into_iter().enumerate().map(of).fold(0.0, f64::max)
+}
+
+/// Each range as `change` says of it and its beam.
+fn changed(scan: &mut Scan, mut change: impl FnMut(usize, f64) -> f64) {
+    let valid_to = scan.valid_to;
+    for (i, range) in scan.arrays().ranges.iter_mut().enumerate().filter(|(_, range)| **range <= valid_to) {
+        *range = change(i, f64::from(*range)).clamp(1.0, valid_to.into()) as u16;
+    }
+}
+
+/// Higher up a sensor sees other things at other ranges; tilted, less on the one side and more on the other.
+#[test]
+fn who_is_lifted_is_refused_or_unsure() {
+    for seed in 0..6 {
+        for factor in [0.5, 0.8, 0.95, 1.05, 1.2, 1.6] {
+            for tilt in [0.0, 0.4] {
+                let mut drive = Drive::through_a_room(seed, 361, 1, 0.01);
+                drive.stand(59);
+                for scan in &mut drive.scans[20..30] {
+                    changed(scan, |i, range| range * (factor + tilt * (i as f64 / 360.0 - 0.5)));
+                }
+                let said = follow(&drive.scans);
+                let place = format!("seed {seed}, {factor} as far, tilt {tilt}");
+                for (at, said) in said.iter().enumerate().skip(1).filter(|(_, said)| said.motion.has_step()) {
+                    let off = deviations(&Rigid::default(), &said.motion);
+                    assert!(off < 5.0, "{place}, scan {at}: off by {off} deviations, {:?}", said.motion);
+                }
+                assert!(said[..20].iter().all(|said| said.foreground == 0), "{place}");
+                // Where the ranges are quite other ones, there is nothing to be unsure of.
+                if (factor - 1.0_f64).abs() > 0.3 {
+                    for at in [20, 30] {
+                        assert_eq!(said[at].motion.how(), MotionMethod::Refused, "{place}, scan {at}");
+                    }
+                    assert!(said.iter().all(|said| said.foreground == 0), "{place}");
+                }
+                let last = said.last().unwrap();
+                assert!(last.motion.has_step() && last.motion.overlap > 0.9, "it goes on: {place}");
+            }
+        }
+    }
+}
+
+/// One beam in ten returns, which is too few to detect motion.
+#[test]
+fn where_little_returns_nothing_moves() {
+    let mut random = Rng::with_seed(9);
+    for seed in 0..4 {
+        let mut drive = Drive::through_a_room(seed, 361, 120, 0.01);
+        for scan in &mut drive.scans[40..60] {
+            let no_return = scan.no_return;
+            scan.arrays()
+                .ranges
+                .iter_mut()
+                .filter(|_| random.u8(..10) != 0)
+                .for_each(|range| *range = no_return);
+        }
+        let said = follow(&drive.scans);
+        for (at, said) in said.iter().enumerate().skip(1) {
+            if said.motion.has_step() {
+                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+                let off = deviations(&truth, &said.motion);
+                assert!(off < 6.0, "{seed} {at}: off by {off} deviations, {:?}", said.motion);
+            }
+            assert!(
+                usize::from(said.lines.readings) <= 361 && said.foreground <= 4,
+                "{seed} {at}: {}",
+                said.foreground
+            );
+        }
+        assert!(said[100..].iter().all(|said| said.motion.has_step()), "{seed}: it goes on");
+    }
+}
+
+/// A scan whose beams have impossible times is not corrected by them.
+#[test]
+fn impossible_times_of_beams_are_ignored() {
+    let mut random = Rng::with_seed(4);
+    let drive = Drive::with_walkers(3, 361, 150, 2, 0.02);
+    let mut jumping = Drive::with_walkers(3, 361, 150, 2, 0.02);
+    for scan in &mut jumping.scans {
+        (scan.beam_time_ns, scan.turn_ns) = (random.u32(..), random.u32(..));
+        scan.first_beam_ns = random.i32(..);
+    }
+    let said = follow(&jumping.scans);
+    for (at, said) in said.iter().enumerate().skip(1) {
+        let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+        let off = truth.inverse().then(&Rigid::new(said.motion.dx_m.into(), said.motion.dy_m.into(), 0.0));
+        assert!(said.motion.has_step() && off.x.hypot(off.y) < 0.03, "{at}: {truth:?} {:?}", said.motion);
+    }
+    assert!(said.iter().any(|said| said.foreground > 0));
 }

@@ -1,0 +1,604 @@
+//! Background models: each method against a slow, independent version in floating point, beam by beam, over many surroundings
+//! and with commands in between; and their shapes, commands, saved models, and scans that no scanner sends.
+
+mod surroundings;
+
+use scanhub_preprocess::background::{Candidate, Class, Method, Mismatch, Model, Settings, Start};
+use scanhub_preprocess::segments::Segmenter;
+use scanhub_schema::{Background, BackgroundHead, Foreground, Pose, Scan, ScanHead};
+use surroundings::{
+    BEAMS, Shape, Surroundings, any_choice, any_model, apart_at_most_mm, check_scan, ranges_mm, reading_mm,
+    unit_mm,
+};
+
+/// One beam as the paper has it.
+#[derive(Clone, Default)]
+struct Beam {
+    /// 0: not known.
+    background_mm: f64,
+    /// Readings in a row that belong to one candidate.
+    run_mm: Vec<f64>,
+}
+
+struct SlowPaper {
+    settings: Settings,
+    beams: Vec<Beam>,
+    frozen: bool,
+    fresh: bool,
+}
+
+/// Two readings that may be infinite.
+fn apart_mm(a: f64, b: f64) -> f64 {
+    if a == b { 0.0 } else { (a - b).abs() }
+}
+
+impl SlowPaper {
+    fn new(settings: Settings, count: u16) -> SlowPaper {
+        SlowPaper { settings, beams: vec![Beam::default(); usize::from(count)], frozen: false, fresh: true }
+    }
+
+    fn reset(&mut self, count: u16) {
+        self.beams = vec![Beam::default(); usize::from(count)];
+        self.fresh = true;
+    }
+
+    fn load(&mut self, ranges_mm: &[f64]) {
+        self.beams = ranges_mm.iter().map(|&mm| Beam { background_mm: mm, run_mm: vec![] }).collect();
+        self.fresh = false;
+    }
+
+    fn update(&mut self, scan: &Scan) -> Vec<Class> {
+        let far = self.settings.no_return_is_far.unwrap_or(false);
+        let threshold_mm = apart_at_most_mm(self.settings.threshold_mm, scan);
+        let candidate_mm = apart_at_most_mm(self.settings.candidate_mm, scan);
+        let ten_seconds = (10.0 * 75.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
+        let scans = self.settings.scans.map_or(ten_seconds, f64::from);
+        let classes = self
+            .beams
+            .iter_mut()
+            .enumerate()
+            .map(|(i, beam)| {
+                let Some(mm) = reading_mm(scan, i, far) else {
+                    return Class::Invalid;
+                };
+                let before = beam.clone();
+                let stands = beam.background_mm != 0.0 && apart_mm(mm, beam.background_mm) <= threshold_mm;
+                if stands {
+                    beam.run_mm.clear();
+                } else {
+                    let candidate = match self.settings.candidate {
+                        Candidate::First => beam.run_mm.first(),
+                        Candidate::Latest => beam.run_mm.last(),
+                    };
+                    if candidate.is_some_and(|&candidate| apart_mm(mm, candidate) > candidate_mm) {
+                        beam.run_mm.clear();
+                    }
+                    beam.run_mm.push(mm);
+                    if beam.run_mm.len() as f64 >= scans {
+                        *beam = Beam { background_mm: mm, run_mm: vec![] };
+                    }
+                }
+                if self.fresh && self.settings.start == Start::FirstScan && mm != 0.0 {
+                    *beam = Beam { background_mm: mm, run_mm: vec![] };
+                }
+                if self.frozen {
+                    *beam = before.clone();
+                }
+                match before.background_mm {
+                    _ if stands => Class::Background,
+                    0.0 => Class::Unknown,
+                    background if mm < background => Class::Foreground,
+                    _ => Class::Behind,
+                }
+            })
+            .collect();
+        self.fresh &= self.frozen;
+        classes
+    }
+}
+
+fn any_settings(random: &mut fastrand::Rng) -> Settings {
+    let mut maybe = |from, to| if random.bool() { Some(random.u16(from..to)) } else { None };
+    let (threshold_mm, candidate_mm, scans) = (maybe(5, 120), maybe(5, 120), maybe(1, 60));
+    Settings {
+        method: Method::Paper,
+        threshold_mm,
+        candidate_mm,
+        scans: scans.map(u32::from),
+        candidate: if random.bool() { Candidate::First } else { Candidate::Latest },
+        start: if random.bool() { Start::Empty } else { Start::FirstScan },
+        no_return_is_far: any_choice(random),
+    }
+}
+
+#[test]
+fn paper_is_identical_beam_by_beam() {
+    let mut seen = [0_u64; 5];
+    let mut adopted = 0_u64;
+    for seed in 0..16 {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let settings = any_settings(&mut random);
+        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
+        let mut model = Model::new(settings, BEAMS);
+        let mut slow = SlowPaper::new(settings, surroundings.shape.count);
+        let mut generation = 0;
+        for number in 0..2_000 {
+            match random.u16(..1_500) {
+                0 => {
+                    model.reset();
+                    slow.reset(surroundings.shape.count);
+                    generation += 1;
+                }
+                1 => {
+                    let saved = any_model(&mut random, surroundings.shape);
+                    model.load(&saved).unwrap();
+                    slow.load(&ranges_mm(&saved));
+                    generation += 1;
+                }
+                2 if number > 0 => {
+                    let other = Shape::any(&mut random);
+                    let same = (other.count, other.unit_mm)
+                        == (surroundings.shape.count, surroundings.shape.unit_mm);
+                    surroundings = Surroundings::new(other, seed);
+                    if !same {
+                        slow.reset(other.count);
+                        generation += 1;
+                    }
+                }
+                3 => {
+                    model.freeze();
+                    slow.frozen = true;
+                }
+                4..8 => {
+                    model.thaw();
+                    slow.frozen = false;
+                }
+                _ => {}
+            }
+            let scan = surroundings.next();
+            let classes = slow.update(&scan);
+            let dirt = random.u8(..);
+            let place = &format_args!("seed {seed}, scan {number}, {settings:?}");
+            check_scan(&mut model, &scan, &classes, generation, dirt, place);
+            classes.iter().for_each(|&class| seen[class as usize] += 1);
+        }
+        let mut shown = Background::zeroed(Background::len(BEAMS));
+        model.show(&mut shown);
+        assert_eq!(ranges_mm(&shown), slow.beams.iter().map(|b| b.background_mm).collect::<Vec<_>>());
+        assert_eq!((shown.generation, shown.is_frozen()), (generation, slow.frozen));
+        assert_eq!(usize::from(shown.taught), shown.ranges().iter().filter(|&&r| r != 0).count());
+        adopted += u64::from(shown.taught);
+    }
+    assert!(seen.iter().all(|&n| n > 10_000) && adopted > 2_000, "{seen:?}, {adopted}: nothing was tried");
+}
+
+/// A surface as a beam remembers it.
+#[derive(Clone, Copy, Debug)]
+struct Surface {
+    /// In device units.
+    at: f64,
+    /// In scans.
+    weight: f64,
+}
+
+impl Surface {
+    fn is_background(&self, scans: f64) -> bool {
+        self.weight >= scans * 5.0 / 8.0
+    }
+}
+
+/// A far range in device units.
+const FAR: f64 = 1e9;
+const NOTHING: Surface = Surface { at: -FAR, weight: 0.0 };
+
+struct SlowMulti {
+    settings: Settings,
+    beams: Vec<[Surface; 3]>,
+    /// Times in a row that each beam, whenever it told anything, told that nothing came back.
+    lost: Vec<u32>,
+    /// Foreground beams of the last scan with their readings: all of them, and the reported ones.
+    seen: Vec<(usize, f64)>,
+    told: Vec<(usize, f64)>,
+    frozen: bool,
+    fresh: bool,
+    /// Scans that are set, for the last scan.
+    scans: f64,
+}
+
+impl SlowMulti {
+    fn new(settings: Settings, count: u16) -> SlowMulti {
+        let beams = vec![[NOTHING; 3]; usize::from(count)];
+        let lost = vec![0; usize::from(count)];
+        SlowMulti {
+            settings,
+            beams,
+            lost,
+            seen: vec![],
+            told: vec![],
+            frozen: false,
+            fresh: true,
+            scans: 0.0,
+        }
+    }
+
+    fn reset(&mut self, count: u16) {
+        *self = SlowMulti { frozen: self.frozen, scans: self.scans, ..SlowMulti::new(self.settings, count) };
+    }
+
+    fn load(&mut self, model: &Background) {
+        self.reset(model.count);
+        let far = |mm: f64| if mm.is_infinite() { FAR } else { mm / unit_mm(model.unit_um) };
+        ranges_mm(model).into_iter().enumerate().for_each(|(i, mm)| self.adopt(i, far(mm)));
+        self.fresh = false;
+    }
+
+    fn adopt(&mut self, i: usize, at: f64) {
+        if at != 0.0 {
+            self.beams[i] = [Surface { at, weight: f64::INFINITY }, NOTHING, NOTHING];
+        }
+    }
+
+    fn nearest(&self, i: usize, scans: f64) -> Option<f64> {
+        let known = self.beams[i].iter().filter(|surface| surface.is_background(scans));
+        known.map(|surface| surface.at).min_by(f64::total_cmp)
+    }
+
+    fn update(&mut self, scan: &Scan) -> Vec<Class> {
+        let unit_mm = unit_mm(scan.unit_um);
+        let far = self.settings.no_return_is_far.unwrap_or(true);
+        let threshold = (apart_at_most_mm(self.settings.threshold_mm, scan) / unit_mm).floor();
+        let scans = (750.0 * (1000.0 * scan.step.to_degrees()).round() / 1000.0).ceil();
+        let scans = self.settings.scans.map_or(scans, f64::from);
+        self.scans = scans;
+        let readings: Vec<Option<f64>> =
+            (0..self.beams.len()).map(|i| Some((reading_mm(scan, i, far)? / unit_mm).min(FAR))).collect();
+        let mut classes: Vec<Class> =
+            (0..readings.len()).map(|i| self.class(i, readings[i], threshold, scans)).collect();
+        self.believe(&mut classes, &readings, unit_mm, (1000.0 * scan.step.to_degrees()).round());
+        if !self.frozen {
+            for (i, reading) in readings.iter().enumerate() {
+                let Some(reading) = *reading else { continue };
+                let lost = if reading == FAR { 0 } else { std::mem::take(&mut self.lost[i]) };
+                self.lost[i] += u32::from(reading == FAR);
+                let gain = f64::from(lost + 1).min((scans / 16.0).floor().clamp(1.0, 16.0));
+                learn(&mut self.beams[i], reading, gain, threshold, scans);
+                if self.fresh && self.settings.start == Start::FirstScan {
+                    self.adopt(i, reading);
+                }
+            }
+            self.fresh = false;
+        }
+        classes
+    }
+
+    fn class(&self, i: usize, reading: Option<f64>, threshold: f64, scans: f64) -> Class {
+        let Some(reading) = reading else { return Class::Invalid };
+        let meets = |surface: &&Surface| (surface.at - reading).abs() <= threshold;
+        if let Some(nearest) = self.nearest(i, scans) {
+            return match reading {
+                _ if self.beams[i].iter().filter(meets).any(|surface| surface.is_background(scans)) => {
+                    Class::Background
+                }
+                _ if reading < nearest => Class::Foreground,
+                _ => Class::Behind,
+            };
+        }
+        let right = (1..=8).find_map(|aside| self.nearest(i.checked_sub(aside)?, scans));
+        let left = (1..=8)
+            .filter(|aside| i + aside < self.beams.len())
+            .find_map(|aside| self.nearest(i + aside, scans));
+        let met = self.beams[i].iter().filter(meets).any(|surface| surface.weight >= scans / 4.0);
+        match (right, left) {
+            (Some(right), Some(left)) if reading < right.min(left) - threshold && !met => Class::Foreground,
+            _ => Class::Unknown,
+        }
+    }
+
+    /// Removes foreground that is not confirmed.
+    fn believe(&mut self, classes: &mut [Class], readings: &[Option<f64>], unit_mm: f64, step_mdeg: f64) {
+        let seen: Vec<(usize, f64)> = (0..classes.len())
+            .filter(|&i| classes[i] == Class::Foreground)
+            .map(|i| (i, readings[i].expect("only readings are in the foreground")))
+            .collect();
+        let mut told = Vec::new();
+        // Two belong to one run if there is nothing but codes between them.
+        let codes = |from: usize, to: usize| (from + 1..to).all(|i| readings[i].is_none());
+        for run in seen.chunk_by(|a, b| codes(a.0, b.0)) {
+            let (first, last) = (run[0].0, run[run.len() - 1].0);
+            let nearest = run.iter().map(|beam| beam.1).fold(FAR, f64::min);
+            let there = |before: &[(usize, f64)]| {
+                before.iter().any(|&(i, range)| {
+                    i + 1 >= first && i <= last + 1 && (range - nearest).abs() * unit_mm <= 200.0
+                })
+            };
+            let beam_mm = nearest * unit_mm * step_mdeg / 57_296.0;
+            let leg = (135.0 / beam_mm).floor().clamp(1.0, 3.0);
+            let is_believed =
+                run.len() >= 3 || there(&self.told) || run.len() as f64 >= leg && there(&self.seen);
+            match is_believed {
+                true => told.extend_from_slice(run),
+                false => run.iter().for_each(|&(i, _)| classes[i] = Class::Unknown),
+            }
+        }
+        (self.seen, self.told) = (seen, told);
+    }
+}
+
+fn learn(surfaces: &mut [Surface; 3], reading: f64, gain: f64, threshold: f64, scans: f64) {
+    surfaces.iter_mut().for_each(|surface| surface.weight = surface.weight.min(scans));
+    let apart = |number: &usize| (surfaces[*number].at - reading).abs();
+    let met = (0..3).filter(|number| apart(number) <= threshold).min_by(|a, b| apart(a).total_cmp(&apart(b)));
+    for (number, surface) in surfaces.iter_mut().enumerate() {
+        if Some(number) == met {
+            surface.weight = (surface.weight + gain).min(scans);
+            surface.at += ((reading - surface.at) / 16.0).trunc();
+        } else {
+            let leak = if reading > surface.at { 0.5 } else { 0.125 };
+            surface.weight = (surface.weight - leak).max(0.0);
+            if surface.weight == 0.0 {
+                *surface = NOTHING;
+            }
+        }
+    }
+    let least = (0..3).min_by(|&a, &b| surfaces[a].weight.total_cmp(&surfaces[b].weight)).expect("three");
+    if met.is_none() && surfaces[least].weight < scans / 4.0 {
+        surfaces[least] = Surface { at: reading, weight: gain };
+    }
+}
+
+#[test]
+fn multi_is_identical_beam_by_beam() {
+    let mut seen = [0_u64; 5];
+    for seed in 0..12 {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let settings = Settings {
+            method: Method::Multi,
+            threshold_mm: if random.bool() { Some(random.u16(5..120)) } else { None },
+            scans: if random.u8(..4) > 0 { Some(random.u32(1..300)) } else { None },
+            start: if random.bool() { Start::Empty } else { Start::FirstScan },
+            no_return_is_far: any_choice(&mut random),
+            ..Settings::default()
+        };
+        let mut surroundings = Surroundings::new(Shape::any(&mut random), seed);
+        let mut model = Model::new(settings, BEAMS);
+        let mut slow = SlowMulti::new(settings, surroundings.shape.count);
+        let mut generation = 0;
+        for number in 0..2_000 {
+            match random.u16(..1_500) {
+                0 => {
+                    model.reset();
+                    slow.reset(surroundings.shape.count);
+                    generation += 1;
+                }
+                1 => {
+                    let saved = any_model(&mut random, surroundings.shape);
+                    model.load(&saved).unwrap();
+                    slow.load(&saved);
+                    generation += 1;
+                }
+                2 => {
+                    model.freeze();
+                    slow.frozen = true;
+                }
+                3..7 => {
+                    model.thaw();
+                    slow.frozen = false;
+                }
+                _ => {}
+            }
+            let scan = surroundings.next();
+            let classes = slow.update(&scan);
+            let dirt = random.u8(..);
+            let place = &format_args!("seed {seed}, scan {number}, {settings:?}");
+            check_scan(&mut model, &scan, &classes, generation, dirt, place);
+            classes.iter().for_each(|&class| seen[class as usize] += 1);
+        }
+        let mut shown = Background::zeroed(Background::len(BEAMS));
+        model.show(&mut shown);
+        for (i, &range) in shown.ranges().iter().enumerate() {
+            let known: Vec<f64> =
+                slow.beams[i].iter().filter(|s| s.is_background(slow.scans)).map(|s| s.at).collect();
+            let at = if range == Background::FAR { FAR } else { f64::from(range) };
+            // A surface at 0 looks like none.
+            assert!(known.contains(&at) || range == 0 && known.is_empty(), "beam {i}: {range}, {known:?}");
+        }
+    }
+    assert!(seen.iter().all(|&n| n > 10_000), "{seen:?}: nothing was tried");
+}
+
+/// Both methods that learn a background.
+const METHODS: [Method; 2] = [Method::Paper, Method::Multi];
+
+fn scan(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
+    Scan::of(ScanHead::lms(count, 0, 500, unit_mm, 13), &vec![range; count])
+}
+
+fn model(method: Method) -> Model {
+    Model::new(Settings { method, scans: Some(8), ..Settings::default() }, BEAMS)
+}
+
+fn shown(model: &Model) -> Box<Background> {
+    let mut background = Background::of_bytes(&[0xA5; Background::len(BEAMS)]);
+    model.show(&mut background);
+    background
+}
+
+/// `model` with another head.
+fn with(model: &Background, change: impl FnOnce(&mut BackgroundHead)) -> Box<Background> {
+    let mut other = model.boxed();
+    change(&mut other);
+    other
+}
+
+/// Passes `scan` to `model` this number of times, and returns the last foreground.
+fn look(model: &mut Model, scan: &Scan, times: usize) -> Box<Foreground> {
+    let mut out = Foreground::of(scan.beams());
+    (0..times).for_each(|_| model.update(scan, &mut out));
+    out
+}
+
+#[test]
+fn learned_compared_frozen_thawed_and_reset() {
+    for method in METHODS {
+        let mut model = model(method);
+        assert_eq!((model.classes(), shown(&model)), (&[][..], Box::default()));
+        look(&mut model, &scan(361, 1, 3_000), 8);
+        let known = shown(&model);
+        assert_eq!((known.count, known.taught, known.generation, known.unit_um), (361, 361, 0, 1000));
+        assert!(known.ranges().iter().all(|&range| range == 3_000) && known.ranges().len() == 361);
+
+        model.freeze();
+        let out = look(&mut model, &scan(361, 1, 2_000), 100);
+        assert_eq!((out.beams, out.ranges()[360], out.ranges().len()), (361, 2_000, 361));
+        assert_eq!(shown(&model), with(&known, |head| head.flags = Background::FROZEN));
+        look(&mut model, &scan(361, 1, 4_000), 1);
+        assert!(model.is_frozen() && model.classes().iter().all(|&class| class == Class::Behind));
+        model.thaw();
+        look(&mut model, &scan(361, 1, 2_000), 8);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0);
+
+        model.reset();
+        assert_eq!((model.generation(), shown(&model).taught, shown(&model).count), (1, 0, 361));
+        assert_eq!(look(&mut model, &scan(361, 1, 1_000), 1).generation, 1);
+        assert!(model.classes().iter().all(|&class| class == Class::Unknown));
+    }
+}
+
+#[test]
+fn another_shape_begins_anew() {
+    for method in METHODS {
+        let mut model = model(method);
+        look(&mut model, &scan(361, 1, 3_000), 20);
+        let mut generation = 0;
+        let mut finer = scan(361, 1, 3_000);
+        finer.step /= 2.0;
+        let mut turned = finer.clone();
+        turned.first_angle = -1.0;
+        for other in [scan(181, 1, 3_000), scan(181, 10, 300), scan(361, 1, 3_000), finer, turned] {
+            generation += 1;
+            assert_eq!(look(&mut model, &other, 1).generation, generation);
+            assert_eq!((shown(&model).taught, shown(&model).count), (0, other.count));
+            look(&mut model, &other, 20);
+            assert_eq!((model.generation(), shown(&model).taught), (generation, other.count));
+        }
+    }
+}
+
+#[test]
+fn a_saved_model_is_taken_if_it_fits() {
+    for method in METHODS {
+        let head = BackgroundHead { unit_um: 1000, generation: 77, ..BackgroundHead::default() };
+        let mut saved = Background::of(head, &[3_000; 361]);
+        saved.ranges_mut()[..3].copy_from_slice(&[0, Background::FAR, 2_500]);
+        let short = |unit_um| Background::of(BackgroundHead { unit_um, ..head }, &saved.ranges()[..181]);
+
+        // Before the first scan.
+        let mut early = model(method);
+        early.load(&saved).unwrap();
+        assert_eq!(shown(&early), with(&saved, |head| (head.generation, head.taught) = (1, 360)));
+        let out = look(&mut early, &scan(361, 1, 1_000), 1);
+        assert_eq!((out.generation, out.beams), (1, 360));
+
+        // It does not fit the first scan, so the model drops it.
+        let mut wrong = model(method);
+        wrong.load(&saved).unwrap();
+        assert_eq!(look(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
+        assert_eq!((shown(&wrong).taught, shown(&wrong).count), (0, 181));
+
+        // Later it is refused, and the model stays what it was.
+        let before = shown(&wrong);
+        let refusal = wrong.load(&saved).unwrap_err();
+        assert_eq!(refusal, Mismatch { model: (361, 1000), sensor: (181, 1000) });
+        assert_eq!(
+            wrong.load(&short(10_000)).unwrap_err().to_string(),
+            "the model has 181 beams in units of 10 mm, the sensor's scans have 181 beams in units of 1 mm"
+        );
+        assert_eq!(shown(&wrong), before);
+        wrong.load(&short(1000)).unwrap();
+        assert_eq!((wrong.generation(), shown(&wrong).taught), (3, 180));
+    }
+}
+
+#[test]
+fn the_first_scan_may_be_the_background() {
+    for method in METHODS {
+        let mut model =
+            Model::new(Settings { method, start: Start::FirstScan, ..Settings::default() }, BEAMS);
+        look(&mut model, &scan(361, 1, 3_000), 1);
+        assert!(
+            model.classes().iter().all(|&class| class == Class::Unknown),
+            "compared before it is learned"
+        );
+        assert_eq!(shown(&model).taught, 361);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 361);
+        model.reset();
+        look(&mut model, &scan(361, 1, 2_000), 1);
+        assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0, "after a reset as well");
+        assert!(shown(&model).ranges().iter().all(|&range| range == 2_000));
+    }
+}
+
+/// A wall that returns 15 % of the beams is learned in 20 s. A person who stands there for 5 s is not, even if some
+/// beams that meet the person are lost.
+#[test]
+fn a_wall_seldom_seen_is_learned_and_who_stands_there_is_not() {
+    let mut random = fastrand::Rng::with_seed(3);
+    let mut some = |share: f64, range: u16| {
+        let mut scan = scan(361, 1, 8191);
+        for value in scan.arrays().ranges {
+            *value = if random.f64() < share { range } else { 8191 };
+        }
+        scan
+    };
+    let mut model = Model::new(Settings::default(), BEAMS);
+    (0..750).for_each(|_| _ = look(&mut model, &some(0.15, 5_000), 1));
+    let wall = look(&mut model, &some(1.0, 5_000), 1).beams;
+    let before_it = look(&mut model, &some(1.0, 3_000), 1).beams;
+    assert!(wall < 10 && before_it == 361, "{wall} beams of the wall, {before_it} before it");
+
+    let mut model = Model::new(Settings::default(), BEAMS);
+    look(&mut model, &some(0.0, 0), 600);
+    (0..187).for_each(|_| _ = look(&mut model, &some(0.97, 3_000), 1));
+    let standing = look(&mut model, &some(1.0, 3_000), 1).beams;
+    assert!(standing > 355, "{standing} beams");
+}
+
+#[test]
+fn no_scan_makes_it_panic() {
+    let mut random = fastrand::Rng::with_seed(1);
+    for method in METHODS {
+        for round in 0..60 {
+            let mut any = || if random.bool() { Some(random.u16(..)) } else { None };
+            let (threshold_mm, candidate_mm, scans) = (any(), any(), any());
+            let settings = Settings {
+                method,
+                threshold_mm,
+                candidate_mm,
+                scans: scans.map(|n| if round % 3 == 0 { u32::MAX } else { u32::from(n % 5) }),
+                start: if random.bool() { Start::Empty } else { Start::FirstScan },
+                no_return_is_far: Some(random.bool()),
+                ..Settings::default()
+            };
+            let mut model = Model::new(settings, BEAMS);
+            let mut cutter = Segmenter::new(Pose { x_m: f64::NAN, y_m: f64::MAX, ..Pose::default() }, BEAMS);
+            let mut bytes = [0_u8; Scan::len(BEAMS + 20, 1)];
+            for _ in 0..40 {
+                // A sensor keeps the shape of its scans for a while, however odd it is.
+                let from = if random.u8(..8) == 0 { 0 } else { Scan::HEAD };
+                random.fill(&mut bytes[from..]);
+                let scan = Scan::of_bytes(&bytes);
+                let dirty = || Foreground::of_bytes(&[0xFF; Foreground::len(BEAMS)]);
+                let mut out = dirty();
+                model.update(&scan, &mut out);
+                assert_eq!(model.classes().len(), scan.beams().min(BEAMS));
+                assert_eq!(out.readings().count(), usize::from(out.beams));
+                cutter.update(&scan, &mut out);
+                let mut foreign = dirty();
+                foreign.count = BEAMS as u16;
+                cutter.update(&scan, &mut foreign);
+                let _ = model.load(&Background::of_bytes(&bytes));
+                shown(&model);
+            }
+        }
+    }
+}
