@@ -3,7 +3,7 @@
 //! missing, the parser discarded. `--count N` sets the number of telegrams, `--pairs N` that of lines.
 //! `hub/drivers/tests/lms/framing.rs` checks the same in other surroundings.
 
-#[path = "../hub/drivers/tests/lms/line/mod.rs"]
+#[path = "../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // The test uses the other surroundings.
 mod line;
 mod support;
@@ -11,9 +11,9 @@ mod support;
 use std::process::ExitCode;
 
 use line::Line;
-use line::account::{Account, framer};
-use line::parsers::{Discarding, Rewinding};
-use line::scene::Scene;
+use line::Scene;
+use line::{Account, framer};
+use line::{Discarding, Rewinding};
 use support::figures::{self, Cell, Figure, Target};
 use support::{Options, Outcome};
 

@@ -16,8 +16,8 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Foreground, Marks, Pose, Scan, Zones};
 
 use crate::datagrams;
-use crate::line::account::Parser;
-use crate::line::parsers::Discarding;
+use crate::line::Discarding;
+use crate::line::Parser;
 use crate::support::baseline::Line;
 use crate::support::consumer::subscribe;
 use crate::support::stage::SENSORS;

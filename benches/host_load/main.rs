@@ -25,7 +25,7 @@
 mod consumer;
 mod cpu_time;
 mod datagrams;
-#[path = "../../hub/drivers/tests/lms/line/mod.rs"]
+#[path = "../../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // Only the simplest parser is used.
 mod line;
 mod set_up;

@@ -1,9 +1,9 @@
 //! The framer's promises on a lossy line, by the thousand: no intact telegram is lost, no wrong one looks clean, and
 //! none is late by more than the hold. Two other parsers read the same line for comparison.
 
-use crate::line::account::{Account, framer};
-use crate::line::parsers::{Discarding, Rewinding};
-use crate::line::scene::Scene;
+use crate::line::Scene;
+use crate::line::{Account, framer};
+use crate::line::{Discarding, Rewinding};
 use crate::line::{Line, TELEGRAM};
 use scanhub_drivers::lms::framer::Tally;
 

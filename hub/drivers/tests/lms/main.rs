@@ -1,6 +1,5 @@
 //! The protocol of the SICK LMS 2xx: framing on lines that lose bytes, replies, and any bytes at all.
 
-mod any_bytes;
 mod captures;
 mod framer;
 mod framing;

@@ -1,4 +1,4 @@
-//! How a session finds its scanner and gets it to measure, from whatever it was doing.
+//! The start of a session with a Slamtec scanner, whatever the scanner was doing before.
 
 use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
@@ -6,8 +6,7 @@ use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Trouble};
 use scanhub_schema::MILLIS;
 
-use crate::session::bench::{Bench, SECOND};
-use crate::session::head::Head;
+use super::{Bench, Head, SECOND};
 
 pub(crate) fn of(model: Model) -> Settings {
     Settings { model: Some(model.name()), ..Settings::default() }
@@ -374,7 +373,7 @@ fn a_greeting_after_other_bytes_is_a_restart() {
 
 #[test]
 fn ranges_that_are_text_are_no_greeting() {
-    // A single point is believed if another one follows it.
+    // A single point counts if another one follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
         let mut bench =
             Bench::new(Settings { mode: Some(mode.name()), ..of(Model::S2) }, Head::new(Model::S2, 1));

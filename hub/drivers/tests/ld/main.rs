@@ -1,4 +1,0 @@
-//! Sessions with scanners of LDROBOT.
-
-mod any_bytes;
-mod session;

@@ -1,0 +1,496 @@
+//! A line that loses bytes in bursts, on a virtual clock: the pieces that a reader gets, and the telegrams that the scanner sent.
+//! An account drives a parser along the line and counts the fate of each telegram. Two parsers as they are usually written serve
+//! as a comparison: both check headers as strictly as the framer, and differ only in their treatment of bytes that are not a
+//! telegram. The test of the framer and the benches `line_loss` and `host_load` use this file.
+//!
+//! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams): one starts at a byte with
+//! probability 7.14e-4, and its length is geometric with mean 1.89. The scanner sends 508 bytes of a telegram, pauses, and
+//! sends the rest; the reader sees pieces of 16, as the FIFO of a UART passes them on.
+
+use fastrand::Rng;
+use scanhub_drivers::line::suspect;
+use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::header::{Expect, StreamHeader};
+use scanhub_drivers::lms::measured;
+use scanhub_drivers::lms::telegram::{STX, Telegram};
+use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN, Unit};
+use scanhub_schema::{MICROS, MILLIS, Nanos};
+
+/// Bytes of each telegram: 361 beams.
+pub(crate) const TELEGRAM: usize = 732;
+/// Time from the first byte of a telegram to the first of the next: 361 beams take two turns.
+const PERIOD: Nanos = 2 * MIRROR_TURN;
+/// Time of a byte at 500 kBd.
+const BYTE: Nanos = 20 * MICROS;
+/// Bytes that a UART collects before it hands them over.
+const PIECE: usize = 16;
+/// A UART passes its bytes on when no byte arrived for four byte times.
+const FLUSH: Nanos = 4 * BYTE;
+
+/// Bytes that become readable together.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Piece {
+    /// When.
+    pub(crate) at: Nanos,
+    /// End of the piece in [`Line::received`]; it begins where the one before ended.
+    pub(crate) end: usize,
+}
+
+/// The history of a line: a number of telegrams, and what was left of them.
+pub(crate) struct Line {
+    /// All that the sensor sent.
+    pub(crate) sent: Vec<u8>,
+    /// Bytes that arrived.
+    pub(crate) received: Vec<u8>,
+    /// Pieces in which these bytes become readable, in order.
+    pub(crate) pieces: Vec<Piece>,
+    /// Header of every telegram.
+    pub(crate) header: StreamHeader,
+    /// First and last + 1 of each run of lost bytes in `sent`, ascending.
+    holes: Vec<(usize, usize)>,
+    /// For each hole where it lies in `received`.
+    cuts: Vec<usize>,
+    /// For each hole how many bytes were lost up to its end.
+    lost: Vec<usize>,
+}
+
+impl Line {
+    /// Creates a line with `telegrams` telegrams of `scene`. The same seed creates the same line.
+    pub(crate) fn new(scene: Scene, telegrams: usize, seed: u64) -> Line {
+        let mut rng = Rng::with_seed(seed);
+        let sent = scene.telegrams(telegrams, &mut rng);
+        let header = sent[..7].try_into().expect("a telegram has a header");
+        let holes = slide_left(&sent, bursts(sent.len(), &mut rng));
+        let mut line = Line {
+            received: Vec::with_capacity(sent.len()),
+            pieces: Vec::new(),
+            header,
+            cuts: Vec::with_capacity(holes.len()),
+            lost: Vec::with_capacity(holes.len()),
+            holes,
+            sent,
+        };
+        line.transmit();
+        line
+    }
+
+    /// Returns the number of the sent byte that arrived as number `received`.
+    pub(crate) fn origin(&self, received: usize) -> usize {
+        let holes = self.cuts.partition_point(|&cut| cut <= received);
+        received + holes.checked_sub(1).map_or(0, |last| self.lost[last])
+    }
+
+    /// Returns the time at which the byte that arrived as number `received` became readable.
+    pub(crate) fn readable_at(&self, received: usize) -> Nanos {
+        self.pieces[self.pieces.partition_point(|piece| piece.end <= received)].at
+    }
+
+    /// Returns whether no byte of telegram number `telegram` was lost.
+    pub(crate) fn is_intact(&self, telegram: usize) -> bool {
+        let (start, end) = (telegram * TELEGRAM, (telegram + 1) * TELEGRAM);
+        let after = self.holes.partition_point(|hole| hole.1 <= start);
+        self.holes.get(after).is_none_or(|hole| hole.0 >= end)
+    }
+
+    /// Returns the bytes of telegram number `telegram` as they were sent.
+    pub(crate) fn telegram(&self, telegram: usize) -> &[u8] {
+        &self.sent[telegram * TELEGRAM..(telegram + 1) * TELEGRAM]
+    }
+
+    /// Returns the number of sent telegrams.
+    pub(crate) fn telegrams(&self) -> usize {
+        self.sent.len() / TELEGRAM
+    }
+
+    fn transmit(&mut self) {
+        let mut next = 0;
+        let mut piece_begin = 0;
+        let mut last = 0;
+        for (start, end) in self.holes.iter().copied().chain([(self.sent.len(), self.sent.len())]) {
+            for number in next..start {
+                let now = sent_at(number);
+                let len = self.received.len() - piece_begin;
+                if len == PIECE || (len > 0 && now - last > FLUSH) {
+                    piece_begin = self.received.len();
+                    self.pieces.push(Piece { at: last, end: piece_begin });
+                }
+                self.received.push(self.sent[number]);
+                last = now;
+            }
+            if end > start {
+                self.cuts.push(self.received.len());
+                self.lost.push(end - self.received.len());
+            }
+            next = end;
+        }
+        self.pieces.push(Piece { at: last, end: self.received.len() });
+    }
+}
+
+/// Returns the time at which the scanner has sent byte `number`.
+pub(crate) fn sent_at(number: usize) -> Nanos {
+    let (telegram, byte) = ((number / TELEGRAM) as Nanos, number % TELEGRAM);
+    let (turn, in_turn) = ((byte / BYTES_PER_TURN) as Nanos, (byte % BYTES_PER_TURN + 1) as Nanos);
+    telegram * PERIOD + turn * MIRROR_TURN + in_turn * BYTE
+}
+
+/// Draws the runs of lost bytes among `len`. Probabilities are multiples of 2^-32, so every machine draws the same
+/// line.
+fn bursts(len: usize, rng: &mut Rng) -> Vec<(usize, usize)> {
+    let chance = |probability: f64| (probability * 4_294_967_296.0) as u32;
+    let (begins, goes_on) = (chance(7.14e-4), chance(1.0 - 1.0 / 1.89));
+    let mut holes = Vec::new();
+    let mut at = 0;
+    while at < len {
+        if rng.u32(..) < begins {
+            let start = at;
+            at += 1;
+            while at < len && rng.u32(..) < goes_on {
+                at += 1;
+            }
+            holes.push((start, at));
+        }
+        at += 1;
+    }
+    holes
+}
+
+/// A lost byte that equals a kept neighbour could as well be that neighbour: the reader sees the same bytes. At a
+/// telegram's border the two histories blame different telegrams, so all that look alike are told alike: the hole
+/// is moved left as far as the bytes are equal, and joined with one it meets.
+fn slide_left(sent: &[u8], holes: Vec<(usize, usize)>) -> Vec<(usize, usize)> {
+    let mut slid: Vec<(usize, usize)> = Vec::with_capacity(holes.len());
+    for (mut start, mut end) in holes {
+        loop {
+            if let Some(&(before, limit)) = slid.last()
+                && limit == start
+            {
+                slid.pop();
+                start = before;
+            } else if start > 0 && sent[start - 1] == sent[end - 1] {
+                start -= 1;
+                end -= 1;
+            } else {
+                break;
+            }
+        }
+        slid.push((start, end));
+    }
+    slid
+}
+
+/// A frame that a parser accepted.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Accepted<'a> {
+    /// Number of its first byte among those read.
+    pub(crate) offset: usize,
+    /// The frame.
+    pub(crate) bytes: &'a [u8],
+    /// Bits of [`suspect`].
+    pub(crate) reasons: u8,
+}
+
+/// A parser that can be compared.
+pub(crate) trait Parser {
+    /// Reads `bytes` and hands over every frame that it accepts.
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>));
+
+    /// Returns the time without bytes after which [`Parser::release`] may return more.
+    fn hold(&self) -> Option<Nanos> {
+        None
+    }
+
+    /// Handles an idle line: no byte arrived for `idle`.
+    fn release(&mut self, _idle: Nanos, _accept: &mut dyn FnMut(Accepted<'_>)) {}
+}
+
+impl Parser for Framer {
+    fn read(&mut self, mut bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+        while !bytes.is_empty() {
+            let spare = self.spare();
+            let len = bytes.len().min(spare.len());
+            spare[..len].copy_from_slice(&bytes[..len]);
+            self.commit(len);
+            bytes = &bytes[len..];
+            drain(self, accept);
+        }
+    }
+
+    fn hold(&self) -> Option<Nanos> {
+        Framer::hold(self)
+    }
+
+    fn release(&mut self, idle: Nanos, accept: &mut dyn FnMut(Accepted<'_>)) {
+        Framer::release(self, idle);
+        drain(self, accept);
+    }
+}
+
+fn drain(framer: &mut Framer, accept: &mut dyn FnMut(Accepted<'_>)) {
+    while let Some(found) = framer.poll() {
+        if let Found::Telegram(framed) = found {
+            let (offset, bytes) = (framed.offset as usize, framed.telegram.bytes());
+            accept(Accepted { offset, bytes, reasons: framed.reasons });
+        }
+    }
+}
+
+/// Creates a framer with the session's settings for this stream.
+pub(crate) fn framer(line: &Line) -> Framer {
+    let mut framer = Framer::default();
+    framer.expect(Expect::Stream { header: line.header, reply: None });
+    framer
+}
+
+/// Fate of the telegrams of one or more lines.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Account {
+    /// Telegrams sent.
+    pub(crate) telegrams: u64,
+    /// Number of these that lost a byte.
+    pub(crate) damaged: u64,
+    /// Were not handed over.
+    pub(crate) lost: u64,
+    /// Were not handed over although every byte arrived.
+    pub(crate) intact_lost: u64,
+    /// Frames handed over that no telegram was.
+    pub(crate) wrong: u64,
+    /// Number of these without a suspect mark.
+    pub(crate) wrong_clean: u64,
+    /// Frames that waited for a header inside them to fail.
+    pub(crate) held: u64,
+    /// Time from the arrival of the last byte to acceptance, of the other telegrams: sum and maximum.
+    pub(crate) extra: Nanos,
+    /// See `extra`.
+    pub(crate) extra_max: Nanos,
+}
+
+impl Account {
+    /// Runs `parser` on `line` to its end like a session: every piece when it arrives, and the release when a read
+    /// finds no bytes after the hold.
+    pub(crate) fn take(&mut self, line: &Line, parser: &mut impl Parser) {
+        let mut delivered = vec![false; line.telegrams()];
+        let mut begin = 0;
+        for (number, piece) in line.pieces.iter().enumerate() {
+            parser.read(&line.received[begin..piece.end], &mut |accepted| {
+                self.enter(line, accepted, piece.at, &mut delivered);
+            });
+            begin = piece.end;
+            let next = line.pieces.get(number + 1).map_or(Nanos::MAX, |next| next.at);
+            while let Some(hold) = parser.hold().filter(|hold| piece.at + hold < next) {
+                parser.release(hold, &mut |accepted| {
+                    self.enter(line, accepted, piece.at + hold, &mut delivered);
+                });
+            }
+        }
+        self.telegrams += line.telegrams() as u64;
+        for (number, delivered) in delivered.into_iter().enumerate() {
+            let intact = line.is_intact(number);
+            self.damaged += u64::from(!intact);
+            self.lost += u64::from(!delivered);
+            self.intact_lost += u64::from(!delivered && intact);
+        }
+    }
+
+    /// Returns the mean extra latency in ms, over `telegrams - lost - held`.
+    pub(crate) fn extra_mean_ms(&self) -> f64 {
+        self.extra as f64 / MILLIS as f64 / (self.telegrams - self.lost - self.held).max(1) as f64
+    }
+
+    /// Returns the largest extra latency in ms.
+    pub(crate) fn extra_max_ms(&self) -> f64 {
+        self.extra_max as f64 / MILLIS as f64
+    }
+
+    fn enter(&mut self, line: &Line, accepted: Accepted<'_>, now: Nanos, delivered: &mut [bool]) {
+        let Accepted { offset, bytes, reasons } = accepted;
+        let last = offset + bytes.len() - 1;
+        assert_eq!(bytes, &line.received[offset..=last], "a parser invents nothing");
+        let number = line.origin(offset) / TELEGRAM;
+        let held = reasons & suspect::HEADER_INSIDE != 0;
+        self.held += u64::from(held);
+        // Bytes decide: a damaged telegram that equal bytes of the next one completed is what was sent.
+        if bytes == line.telegram(number) && !delivered[number] {
+            delivered[number] = true;
+            let extra = now - line.readable_at(last);
+            if !held {
+                self.extra += extra;
+                self.extra_max = self.extra_max.max(extra);
+            }
+            return;
+        }
+        self.wrong += 1;
+        // The session adds this reason to those of the framer.
+        let took = sent_at(line.origin(last)) - sent_at(line.origin(offset));
+        let slow = took > sent_at(TELEGRAM - 1) - sent_at(0) + SLOW;
+        self.wrong_clean += u64::from(reasons == 0 && !slow);
+    }
+}
+
+impl core::ops::AddAssign for Account {
+    fn add_assign(&mut self, other: Account) {
+        self.telegrams += other.telegrams;
+        self.damaged += other.damaged;
+        self.lost += other.lost;
+        self.intact_lost += other.intact_lost;
+        self.wrong += other.wrong;
+        self.wrong_clean += other.wrong_clean;
+        self.held += other.held;
+        self.extra += other.extra;
+        self.extra_max = self.extra_max.max(other.extra_max);
+    }
+}
+
+/// A telegram that takes longer than usual by this time is suspect.
+const SLOW: Nanos = 8 * MILLIS;
+
+/// A state machine with six states that collects a telegram, and discards what it collected if it turns out not to be a
+/// telegram.
+pub(crate) struct Discarding {
+    header: StreamHeader,
+    collected: Vec<u8>,
+    read: usize,
+}
+
+impl Discarding {
+    pub(crate) fn new(header: StreamHeader) -> Self {
+        Discarding { header, collected: Vec::with_capacity(TELEGRAM), read: 0 }
+    }
+}
+
+impl Parser for Discarding {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+        for &byte in bytes {
+            self.read += 1;
+            self.collected.push(byte);
+            let fits = match *self.collected.as_slice() {
+                [stx] => stx == STX,
+                [_, address] => address == self.header[1],
+                // The low byte of the length is not checked alone.
+                [_, _, _] => true,
+                [_, _, low, high] => [low, high] == self.header[2..4],
+                ref collected if collected.len() < TELEGRAM => true,
+                ref collected => {
+                    if Telegram::check(collected).is_some() {
+                        accept(Accepted { offset: self.read - TELEGRAM, bytes: collected, reasons: 0 });
+                    }
+                    false
+                }
+            };
+            if !fits {
+                self.collected.clear();
+            }
+        }
+    }
+}
+
+/// Collects a telegram after a strict header, and returns to the byte after its start byte if it turns out not to be a
+/// telegram.
+pub(crate) struct Rewinding {
+    header: StreamHeader,
+    open: Vec<u8>,
+    read: usize,
+}
+
+impl Rewinding {
+    pub(crate) fn new(header: StreamHeader) -> Self {
+        Rewinding { header, open: Vec::with_capacity(2 * TELEGRAM), read: 0 }
+    }
+}
+
+impl Parser for Rewinding {
+    fn read(&mut self, bytes: &[u8], accept: &mut dyn FnMut(Accepted<'_>)) {
+        self.open.extend(bytes);
+        self.read += bytes.len();
+        let mut at = 0;
+        while at < self.open.len() {
+            let open = &self.open[at..];
+            let known = open.len().min(self.header.len());
+            if open[..known] != self.header[..known] {
+                at += 1;
+            } else if open.len() < TELEGRAM {
+                break;
+            } else if Telegram::check(&open[..TELEGRAM]).is_some() {
+                accept(Accepted { offset: self.read - open.len(), bytes: &open[..TELEGRAM], reasons: 0 });
+                at += TELEGRAM;
+            } else {
+                at += 1;
+            }
+        }
+        self.open.drain(..at);
+    }
+}
+
+const BEAMS: usize = 361;
+
+/// A surrounding, and what makes it easy or hard.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Scene {
+    /// Walls and furniture with noise, in mm: the everyday case.
+    Furnished,
+    /// Only a few grains of dust in range: long runs of equal bytes, in which losses look alike.
+    Empty,
+    /// A wall at 640 cm all around: its words are the first two bytes of a header.
+    Wall,
+    /// Random words: every byte value everywhere, whatever a room may be.
+    Random,
+}
+
+impl Scene {
+    /// All four.
+    pub(crate) const ALL: [Scene; 4] = [Scene::Furnished, Scene::Empty, Scene::Wall, Scene::Random];
+
+    /// Returns its name in a table.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Scene::Furnished => "furnished",
+            Scene::Empty => "empty",
+            Scene::Wall => "wall at 640 cm",
+            Scene::Random => "random words",
+        }
+    }
+
+    /// Returns the bytes of `count` consecutive telegrams.
+    pub(crate) fn telegrams(self, count: usize, rng: &mut Rng) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(count * TELEGRAM);
+        let mut room = [0; BEAMS];
+        for number in 0..count {
+            if number % SCANS_PER_PLACE == 0 {
+                room = furniture(rng);
+            }
+            let words = match self {
+                Scene::Furnished => room.map(|range| range + rng.u16(..10)),
+                Scene::Empty => [FAR; BEAMS].map(|far| one_in(rng, 200).map_or(far, |rng| rng.u16(20..4000))),
+                Scene::Wall => [640; BEAMS].map(|wall| one_in(rng, 40).map_or(wall, |rng| rng.u16(639..642))),
+                Scene::Random => [0; BEAMS].map(|_: u16| rng.u16(..)),
+            };
+            let unit = if self == Scene::Wall { Unit::Cm } else { Unit::Mm };
+            bytes.extend(measured::encode(0, unit, &words, 0x10).bytes());
+        }
+        bytes
+    }
+}
+
+/// Flat faces, each a run of beams whose ranges rise or fall evenly.
+fn furniture(rng: &mut Rng) -> [u16; BEAMS] {
+    let mut ranges = [0; BEAMS];
+    let mut at = 0;
+    while at < BEAMS {
+        let beams = rng.usize(8..60).min(BEAMS - at);
+        let (near, slope) = (rng.i32(500..7000), rng.i32(-15..16));
+        for (i, range) in ranges[at..at + beams].iter_mut().enumerate() {
+            *range = (near + slope * i as i32).clamp(20, 8000) as u16;
+        }
+        at += beams;
+    }
+    ranges
+}
+
+fn one_in(rng: &mut Rng, n: u32) -> Option<&mut Rng> {
+    (rng.u32(..n) == 0).then_some(rng)
+}
+
+/// The code of a beam without return, 13 bits.
+const FAR: u16 = 0x1FFF;
+/// Number of scans after which a moving robot sees another part of the room.
+const SCANS_PER_PLACE: usize = 100;

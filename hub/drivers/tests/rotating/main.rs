@@ -1,0 +1,67 @@
+//! Sessions with rotating scanners, and the line from such a scanner, which damages bytes.
+
+mod ld;
+mod rplidar;
+
+use std::collections::VecDeque;
+
+use scanhub_schema::{Nanos, line_time};
+
+/// Faults of the bytes of packets, as shares of all bytes.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Damage {
+    /// Starts of bursts that are lost. Their mean length is four bytes.
+    lost: f64,
+    /// Bytes that follow an inserted one.
+    inserted: f64,
+    /// Bytes with flipped bits.
+    flipped: f64,
+}
+
+/// The line from a scanner to the host.
+pub(crate) struct DamagedLine {
+    damage: Damage,
+    is_in_burst: bool,
+    /// Bytes on the line, with the times at which they arrive.
+    bytes: VecDeque<(Nanos, u8)>,
+}
+
+/// A packet as it was sent.
+pub(crate) struct Sent {
+    bytes: Vec<u8>,
+    intact: bool,
+    /// Time at which its last byte has left the line, if none was lost.
+    at: Nanos,
+}
+
+impl DamagedLine {
+    fn new(damage: Damage) -> DamagedLine {
+        DamagedLine { damage, is_in_burst: false, bytes: VecDeque::new() }
+    }
+
+    /// Puts `packet` on the line at `from` with `baud` bits per second.
+    fn carry(&mut self, packet: &[u8], from: Nanos, baud: u32, random: &mut fastrand::Rng) -> Sent {
+        let (mut intact, mut at) = (true, from);
+        for (place, &byte) in packet.iter().enumerate() {
+            at += line_time(1, baud);
+            let stays = if self.is_in_burst { 0.75 } else { self.damage.lost };
+            self.is_in_burst = random.f64() < stays;
+            if random.f64() < self.damage.inserted {
+                self.bytes.push_back((at, random.u8(..)));
+                intact &= place == 0;
+            }
+            let flip = if random.f64() < self.damage.flipped { random.u8(1..) } else { 0 };
+            intact &= !self.is_in_burst && flip == 0;
+            if !self.is_in_burst {
+                self.bytes.push_back((at, byte ^ flip));
+            }
+        }
+        Sent { bytes: packet.to_vec(), intact, at }
+    }
+
+    /// Returns the bytes that have arrived by `now`, at most `room`.
+    fn read(&mut self, now: Nanos, room: usize) -> Vec<u8> {
+        let count = self.bytes.iter().take(room).take_while(|(at, _)| *at <= now).count();
+        self.bytes.drain(..count).map(|(_, byte)| byte).collect()
+    }
+}

@@ -1,4 +1,0 @@
-//! Sessions with scanners of Slamtec.
-
-mod any_bytes;
-mod session;
