@@ -1,5 +1,5 @@
-//! A simulator in a thread, a folder for its files, and a host that opens its port, writes requests, and finds the telegrams in
-//! what arrives.
+//! A simulator in a thread, a folder for its files, and a host that opens its port, writes requests, and finds the
+//! telegrams in the received bytes.
 
 use std::io::Write;
 use std::os::fd::OwnedFd;
@@ -67,7 +67,7 @@ impl Simulator {
         self.records.recv_timeout(PATIENCE).expect("a telegram is sent")
     }
 
-    /// The first record from now on that `wanted` is about.
+    /// Returns the next record that fulfills `wanted`.
     pub(crate) fn record_where(&self, wanted: impl Fn(&Record) -> bool) -> Record {
         let end = Instant::now() + PATIENCE;
         while Instant::now() < end {
@@ -79,7 +79,7 @@ impl Simulator {
         panic!("no such telegram was sent");
     }
 
-    /// What was sent that did not arrive, as far as nobody asked yet.
+    /// Returns the sent telegrams that did not arrive, since the last call.
     pub(crate) fn faults(&self) -> Vec<(u64, Fault)> {
         self.records.try_iter().filter_map(|record| Some((record.index, record.fault?))).collect()
     }

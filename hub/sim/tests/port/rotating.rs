@@ -126,7 +126,7 @@ fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
     assert!(refused(SimulateOptions { state, ..of(Model::A1) }).message.contains("no state"));
 }
 
-/// Drives `session` on the port of `host` until it has told `turns`; the packets that came.
+/// Runs `session` on the port of `host` until it has delivered `turns`, and returns the received packets.
 fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
     let (end, mut packets, mut told) = (Instant::now() + PATIENCE, Vec::new(), 0);
     while told < turns {

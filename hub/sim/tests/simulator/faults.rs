@@ -71,8 +71,8 @@ fn no_scene_is_about_nothing() {
     }
 }
 
-/// Deliveries that nobody sent: none, but where bytes are changed or foreign. Of any two flipped bits the sensor's
-/// checksum passes 1.19e-3, and nothing else on the line would tell; those need not even be marked.
+/// Returns whether the session delivered only telegrams that the scanner sent. Changed and foreign bytes are an
+/// exception: the scanner's checksum accepts 1.19e-3 of all pairs of flipped bits, and such telegrams need no mark.
 fn is_sound(all: &Verdict, faults: &str) -> bool {
     let flips = faults.starts_with("flip");
     let changes = ["flip=", "insert=", "double=", "length=", "flood=", "wall="];
@@ -174,7 +174,8 @@ impl Scene {
         let healed = bench.now;
         let streams = |bench: &Bench| bench.is_streaming() && !bench.received_scans(healed).is_empty();
         let back = bench.until(&self.name(seed), LONGEST, streams);
-        // What was held back by damage is out after some whole ones, and the last one after a pause.
+        // Telegrams that were held back after damage are released after some intact ones, and the last one after a
+        // pause.
         bench.run(80 * MILLIS);
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);

@@ -27,7 +27,7 @@ fn delivered(faults: Faults, seed: u64, span: Nanos) -> (usize, usize) {
         bytes
     });
     bench.run(span);
-    // Telegrams that were held back after damage are released after some whole ones, and the last one after a pause.
+    // Telegrams that were held back after damage are released after some intact ones, and the last one after a pause.
     bench.run(200 * MILLIS);
     bench.to_host = Box::new(|_, _| Vec::new());
     bench.run(60 * MILLIS);

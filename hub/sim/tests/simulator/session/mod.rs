@@ -143,7 +143,7 @@ impl Bench {
         Bench::wanting(WANTED, machine, now)
     }
 
-    /// Like [`Bench::new`], with other settings.
+    /// Creates a session like [`Bench::new`], with other settings.
     pub(crate) fn wanting(wanted: Settings, mut machine: LmsSimulator, now: Nanos) -> Bench {
         while machine.poll_transmit(now).is_some() {}
         Bench {

@@ -410,8 +410,8 @@ fn mount(world: &World) -> &Mount {
     world.mount(0).expect("its sensor has a mount")
 }
 
-/// Where each beam with a range ends that ended at `end_ns`, in the frame of the mount's axis on the floor: to the right,
-/// ahead, up. By the angle at the beam's own time.
+/// Returns the end points of the beams with a range in the scan that ended at `end_ns`: right, ahead and up in the
+/// frame of the mount's axis on the floor. Each beam has the angle of its own time.
 fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
     let scan = look(&Room::new(world, 1), end_ns);
     let head = ScanHead::lms(361, -90_000, 500, 1, 13);
