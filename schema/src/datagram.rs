@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, pod_read_unaligned};
 use crc::{CRC_32_ISCSI, Crc, Table};
 
 use crate::payload::{read_head, write};
+use crate::text::named;
 use crate::{Topic, check_sensor, text};
 
 pub use crate::payload::{FixedPayload, Packed, UsedElements};
@@ -334,46 +335,23 @@ pub enum DatagramError {
     Payload,
 }
 
-impl DatagramError {
-    /// All reasons, in the order of the checks.
-    pub const ALL: [DatagramError; 15] = [
-        DatagramError::Short,
-        DatagramError::Magic,
-        DatagramError::Version,
-        DatagramError::Header,
-        DatagramError::Length,
-        DatagramError::Crc,
-        DatagramError::Unauthenticated,
-        DatagramError::Mac,
-        DatagramError::Epoch,
-        DatagramError::Untimely,
-        DatagramError::Twin,
-        DatagramError::Stale,
-        DatagramError::Capacity,
-        DatagramError::Skipped,
-        DatagramError::Payload,
-    ];
-
-    /// Returns the reason's name in all output.
-    pub fn name(self) -> &'static str {
-        match self {
-            DatagramError::Short => "short",
-            DatagramError::Magic => "magic",
-            DatagramError::Version => "version",
-            DatagramError::Header => "header",
-            DatagramError::Length => "length",
-            DatagramError::Crc => "crc",
-            DatagramError::Unauthenticated => "unauthenticated",
-            DatagramError::Mac => "mac",
-            DatagramError::Epoch => "epoch",
-            DatagramError::Untimely => "untimely",
-            DatagramError::Twin => "twin",
-            DatagramError::Stale => "stale",
-            DatagramError::Capacity => "capacity",
-            DatagramError::Skipped => "skipped",
-            DatagramError::Payload => "payload",
-        }
-    }
+named! {
+    DatagramError:
+    Short "short",
+    Magic "magic",
+    Version "version",
+    Header "header",
+    Length "length",
+    Crc "crc",
+    Unauthenticated "unauthenticated",
+    Mac "mac",
+    Epoch "epoch",
+    Untimely "untimely",
+    Twin "twin",
+    Stale "stale",
+    Capacity "capacity",
+    Skipped "skipped",
+    Payload "payload",
 }
 
 /// The payload of an announcement.

@@ -6,6 +6,7 @@
 
 use std::f64::consts::TAU;
 
+use crate::text::named;
 use crate::{Code, Contents, ScanHead};
 
 /// A family of scanners with one protocol.
@@ -31,21 +32,16 @@ pub struct PacketFacts {
     pub packets: usize,
 }
 
-impl Family {
-    /// All families.
-    pub const ALL: [Family; 3] = [Family::Lms, Family::Ld, Family::Rplidar];
+named! {
+    Family:
+    Lms "lms",
+    Ld "ld",
+    Rplidar "rplidar",
+}
 
+impl Family {
     /// Number in place of a family while the hub searches for the scanner.
     pub const UNKNOWN: u8 = 255;
-
-    /// Returns the family's name in configurations and in all output.
-    pub fn name(self) -> &'static str {
-        match self {
-            Family::Lms => "lms",
-            Family::Ld => "ld",
-            Family::Rplidar => "rplidar",
-        }
-    }
 
     /// Returns the family called `name`, in upper or lower case.
     pub fn parse(name: &str) -> Option<Family> {
@@ -203,12 +199,12 @@ pub(crate) const REFLECTOR_MODE: u8 = 0x01;
 /// Time of one revolution of the mirror (75 Hz).
 const TURN_NS: u32 = 13_320_000;
 
-/// What a scanner sent, with names for its fields.
+/// Bytes that a scanner sent, with names for their fields.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Telegram<'a> {
-    /// Of which family it is; nothing if this version does not know it.
+    /// Family of the scanner; `None` if this version does not know it.
     pub family: Option<Family>,
-    /// Its bytes, as they came.
+    /// The bytes as they were received.
     pub bytes: &'a [u8],
 }
 
@@ -245,7 +241,7 @@ impl<'a> Telegram<'a> {
         self.family == Some(Family::Lms)
     }
 
-    /// Returns what can be said of packets; nothing of an LMS, and of a family that this version does not know.
+    /// Returns facts about the packets. `None` for an LMS, and for a family that this version does not know.
     pub fn packets(self) -> Option<PacketFacts> {
         self.family?.packets(self.bytes)
     }

@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::payload::{FixedPayload, are_finite};
+use crate::text::named;
 
 /// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///
@@ -64,28 +65,14 @@ pub enum MotionMethod {
     Both,
 }
 
-impl MotionMethod {
-    /// All, in the order of their numbers.
-    pub const ALL: [MotionMethod; 6] = [
-        MotionMethod::First,
-        MotionMethod::Refused,
-        MotionMethod::Beams,
-        MotionMethod::Points,
-        MotionMethod::Lines,
-        MotionMethod::Both,
-    ];
-
-    /// Returns the word for it in all output.
-    pub const fn name(self) -> &'static str {
-        match self {
-            MotionMethod::First => "first",
-            MotionMethod::Refused => "refused",
-            MotionMethod::Beams => "beams",
-            MotionMethod::Points => "points",
-            MotionMethod::Lines => "lines",
-            MotionMethod::Both => "both",
-        }
-    }
+named! {
+    MotionMethod:
+    First "first",
+    Refused "refused",
+    Beams "beams",
+    Points "points",
+    Lines "lines",
+    Both "both",
 }
 
 impl fmt::Display for MotionMethod {
@@ -101,7 +88,7 @@ impl Default for Motion {
 }
 
 impl FixedPayload for Motion {
-    /// It ends before the covariance of the pose.
+    /// The covariance of the pose is missing.
     const FIRST_REVISION: usize = std::mem::offset_of!(Motion, pose_covariance);
 
     fn is_valid(&self) -> bool {

@@ -38,7 +38,7 @@ pub trait Packed {
 
 /// A payload whose struct has a fixed size.
 pub trait FixedPayload: Pod {
-    /// The last fields, if they are arrays of which a datagram has only the used elements.
+    /// Arrays at the end of the struct. A datagram has only their used elements.
     const ARRAYS: &'static [UsedElements] = &[];
     /// Length in bytes of the first revision. Fields that it does not have are read as 0.
     const FIRST_REVISION: usize = size_of::<Self>();
@@ -279,7 +279,7 @@ macro_rules! sliced {
                 Self::of_bytes(self.bytes())
             }
 
-            /// Returns a copy of what [`bytes`](Self::bytes) returned.
+            /// Returns a copy of `bytes`, which [`bytes`](Self::bytes) returned.
             pub fn of_bytes(bytes: &[u8]) -> Box<Self> {
                 let mut copy = Self::zeroed(bytes.len());
                 copy.copy_from(bytes);

@@ -9,6 +9,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::family::{REFLECTOR_MODE, has_reflector_bits};
 use crate::payload::FixedPayload;
+use crate::text::named;
 use crate::{Family, text};
 
 /// Room for counters in a [`Status`]; new ones append.
@@ -250,30 +251,15 @@ pub enum State {
     Paused = 6,
 }
 
-impl State {
-    /// All states, by their number.
-    pub const ALL: [State; 7] = [
-        State::Absent,
-        State::Probing,
-        State::Switching,
-        State::Starting,
-        State::Streaming,
-        State::Silent,
-        State::Paused,
-    ];
-
-    /// Returns the state's name in all output.
-    pub fn name(self) -> &'static str {
-        match self {
-            State::Absent => "absent",
-            State::Probing => "probing",
-            State::Switching => "switching",
-            State::Starting => "starting",
-            State::Streaming => "streaming",
-            State::Silent => "silent",
-            State::Paused => "paused",
-        }
-    }
+named! {
+    State:
+    Absent "absent",
+    Probing "probing",
+    Switching "switching",
+    Starting "starting",
+    Streaming "streaming",
+    Silent "silent",
+    Paused "paused",
 }
 
 /// The counters of a link. All grow only, except the gauges: `bytes_buffered`, `damaged_ppm` and `lost_ppm`.
@@ -355,7 +341,7 @@ counters! {
 
 /// A sensor's pose in the robot's frame: x ahead, y left, the origin at the robot's center. 32 bytes.
 ///
-/// The default is a sensor at the centre that looks ahead.
+/// The default is a sensor at the center that looks ahead.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Pose.v2"))]
 #[repr(C)]

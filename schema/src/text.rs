@@ -25,6 +25,23 @@ pub(crate) fn read(field: &[u8]) -> &str {
     }
 }
 
+/// Defines the names of an enum's values, in the order of their numbers: `ALL` and `name`.
+macro_rules! named {
+    ($type:ident: $($variant:ident $name:literal,)*) => {
+        impl $type {
+            /// All values, in the order of their numbers.
+            pub const ALL: [$type; [$($name),*].len()] = [$($type::$variant),*];
+
+            /// Returns the name in all output.
+            pub const fn name(self) -> &'static str {
+                match self { $($type::$variant => $name,)* }
+            }
+        }
+    };
+}
+
+pub(crate) use named;
+
 /// Shows control characters (C0, DEL and C1 of ECMA-48) as `?`, except line feeds.
 #[derive(Clone, Copy, Debug)]
 pub struct Printable<'a>(pub &'a str);
@@ -74,11 +91,11 @@ pub enum Kind {
     NameHeld,
     /// Syntax of the command line, a topic that there is not, or a form that the verb does not take: exit 2.
     Usage,
-    /// No hub lives in the domain: exit 3.
+    /// No hub runs in the domain: exit 3.
     NoHub,
     /// The hub, or the recording, has no such sensor: exit 3.
     NoTopic,
-    /// Nothing came within the time allowed: exit 3.
+    /// No sample arrived in time: exit 3.
     Timeout,
     /// The port does not exist: exit 4.
     PortMissing,
@@ -151,11 +168,11 @@ impl Kind {
 /// A failure with its remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Failure {
-    /// What kind it is.
+    /// Kind of the failure.
     pub kind: Kind,
-    /// What happened: the place and the value.
+    /// Message with the place and the value.
     pub message: String,
-    /// What would be right; may be empty.
+    /// Remedy; may be empty.
     pub hint: String,
 }
 

@@ -11,6 +11,7 @@ use crate::limits::TopicLimits;
 use crate::payload::{
     FixedPayload, UsedElements, are_finite, packed_as_is, read_head, sliced, used_elements,
 };
+use crate::text::named;
 use crate::topic::PayloadLen;
 use crate::{BEAMS, Header};
 
@@ -98,20 +99,12 @@ pub enum PointClass {
     Behind,
 }
 
-impl PointClass {
-    /// All classes, in the order of their numbers.
-    pub const ALL: [PointClass; 4] =
-        [PointClass::Unknown, PointClass::Background, PointClass::Foreground, PointClass::Behind];
-
-    /// Returns the name in all output.
-    pub const fn name(self) -> &'static str {
-        match self {
-            PointClass::Unknown => "unknown",
-            PointClass::Background => "background",
-            PointClass::Foreground => "foreground",
-            PointClass::Behind => "behind",
-        }
-    }
+named! {
+    PointClass:
+    Unknown "unknown",
+    Background "background",
+    Foreground "foreground",
+    Behind "behind",
 }
 
 impl CloudPoint {

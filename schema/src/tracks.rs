@@ -5,6 +5,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::payload::{FixedPayload, UsedElements, are_finite, used_elements};
+use crate::text::named;
 use crate::{Pose, text};
 
 /// Maximum number of people in a sample.
@@ -94,20 +95,12 @@ pub enum TrackState {
     BetweenRooms,
 }
 
-impl TrackState {
-    /// All states, in the order of their numbers.
-    pub const ALL: [TrackState; 4] =
-        [TrackState::Tentative, TrackState::Confirmed, TrackState::Hidden, TrackState::BetweenRooms];
-
-    /// Returns the name in all output.
-    pub const fn name(self) -> &'static str {
-        match self {
-            TrackState::Tentative => "tentative",
-            TrackState::Confirmed => "confirmed",
-            TrackState::Hidden => "hidden",
-            TrackState::BetweenRooms => "between_rooms",
-        }
-    }
+named! {
+    TrackState:
+    Tentative "tentative",
+    Confirmed "confirmed",
+    Hidden "hidden",
+    BetweenRooms "between_rooms",
 }
 
 impl Default for Tracks {
@@ -247,19 +240,14 @@ pub enum EventKind {
     Door,
 }
 
+named! {
+    EventKind:
+    Appeared "appeared",
+    Left "left",
+    Door "door",
+}
+
 impl EventKind {
-    /// All kinds, in the order of their numbers.
-    pub const ALL: [EventKind; 3] = [EventKind::Appeared, EventKind::Left, EventKind::Door];
-
-    /// Returns the name in all output.
-    pub const fn name(self) -> &'static str {
-        match self {
-            EventKind::Appeared => "appeared",
-            EventKind::Left => "left",
-            EventKind::Door => "door",
-        }
-    }
-
     /// Returns the kind with this number, or `None` if this version does not know it.
     pub fn of_number(number: u8) -> Option<EventKind> {
         EventKind::ALL.get(usize::from(number)).copied()

@@ -5,6 +5,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::payload::{FixedPayload, UsedElements, used_elements};
+use crate::text::named;
 
 /// Maximum number of zones of a sensor.
 pub const ZONES: usize = 8;
@@ -115,23 +116,18 @@ pub enum Verdict {
     Unknown = 3,
 }
 
-impl Verdict {
-    /// All verdicts, in the order of their numbers.
-    pub const ALL: [Verdict; 4] = [Verdict::Clear, Verdict::Slow, Verdict::Stop, Verdict::Unknown];
+named! {
+    Verdict:
+    Clear "clear",
+    Slow "slow",
+    Stop "stop",
+    Unknown "unknown",
+}
 
+impl Verdict {
     /// Returns the verdict with this number; unknown if this version does not know it.
     pub(crate) fn of(number: u8) -> Verdict {
         Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == number).unwrap_or(Verdict::Unknown)
-    }
-
-    /// Returns the verdict's name in all output.
-    pub fn name(self) -> &'static str {
-        match self {
-            Verdict::Clear => "clear",
-            Verdict::Slow => "slow",
-            Verdict::Stop => "stop",
-            Verdict::Unknown => "unknown",
-        }
     }
 
     /// Returns the worse of two verdicts: stop, then unknown, then slow, then clear. An object inside outweighs missing
