@@ -33,6 +33,7 @@ pub mod clock;
 mod control;
 mod follower;
 mod freshness;
+mod join;
 mod live;
 mod numbers;
 mod presence;

@@ -24,6 +24,7 @@
 
 pub use crate::follower::Follower;
 pub use crate::freshness::Freshness;
+pub use crate::join::Join;
 pub use crate::numbers::{Noted, Numbers};
 pub use crate::presence::{Change, GRACE, Who, find};
 pub use crate::robot::{RobotHeard, RobotSource};

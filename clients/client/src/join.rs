@@ -1,0 +1,172 @@
+//! Joins the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They arrive
+//! one after the other, and either one may be missing.
+
+use std::collections::VecDeque;
+
+use scanhub_schema::Header;
+
+/// Pairs of samples with the same `boot` and `seq`, from two topics of one sensor. Time is an argument.
+///
+/// A sample waits for its partner until the partner's topic sends a later one, so for one period. If that topic is silent, it
+/// waits for 1 s.
+///
+/// # Examples
+///
+/// ```
+/// use scanhub_client::Header;
+/// use scanhub_client::streams::Join;
+///
+/// let header = |seq| Header { seq, ..Header::default() };
+/// let mut join = Join::default();
+/// assert_eq!(join.first(&header(1), "scan 1", 0), None);
+/// assert_eq!(join.first(&header(2), "scan 2", 13), None);
+/// assert_eq!(join.second(&header(2), "foreground 2", 15), Some(("scan 2", "foreground 2")));
+/// assert_eq!(join.dropped(), 1, "foreground 1 was lost");
+/// ```
+#[derive(Debug)]
+pub struct Join<A, B> {
+    first: VecDeque<Waiting<A>>,
+    second: VecDeque<Waiting<B>>,
+    dropped: u64,
+}
+
+#[derive(Debug)]
+struct Waiting<T> {
+    boot: u64,
+    seq: u64,
+    since_ns: u64,
+    sample: T,
+}
+
+/// Maximum number of samples of a topic that wait.
+const MAX_WAITING: usize = 64;
+/// Time after which a sample is dropped if the other topic is silent.
+const SILENCE_NS: u64 = 1_000_000_000;
+
+impl<A, B> Default for Join<A, B> {
+    fn default() -> Join<A, B> {
+        Join { first: VecDeque::new(), second: VecDeque::new(), dropped: 0 }
+    }
+}
+
+impl<A, B> Join<A, B> {
+    /// Takes a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has arrived.
+    pub fn first(&mut self, header: &Header, sample: A, now_ns: u64) -> Option<(A, B)> {
+        match partner(&mut self.second, header, &mut self.dropped) {
+            Some(partner) => Some((sample, partner)),
+            None => {
+                wait(&mut self.first, header, sample, now_ns, &mut self.dropped);
+                None
+            }
+        }
+    }
+
+    /// Takes a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has arrived.
+    pub fn second(&mut self, header: &Header, sample: B, now_ns: u64) -> Option<(A, B)> {
+        match partner(&mut self.first, header, &mut self.dropped) {
+            Some(partner) => Some((partner, sample)),
+            None => {
+                wait(&mut self.second, header, sample, now_ns, &mut self.dropped);
+                None
+            }
+        }
+    }
+
+    /// Drops the samples whose partner's topic is silent. Call it when all samples that have arrived were taken: after a pause
+    /// of the program, a partner may be among them.
+    pub fn expire(&mut self, now_ns: u64) {
+        self.dropped += expire(&mut self.first, now_ns) + expire(&mut self.second, now_ns);
+    }
+
+    /// Returns the number of samples that were dropped because they have no partner.
+    pub fn dropped(&self) -> u64 {
+        self.dropped
+    }
+}
+
+/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it: the topics are in order,
+/// so the partners of these are lost.
+fn partner<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
+    let is_earlier = |one: &&Waiting<T>| one.boot == header.boot && one.seq < header.seq;
+    let found = waiting.iter().position(|one| (one.boot, one.seq) == (header.boot, header.seq));
+    let earlier = found.unwrap_or_else(|| waiting.iter().take_while(is_earlier).count());
+    waiting.drain(..earlier);
+    *dropped += earlier as u64;
+    found.and_then(|_| waiting.pop_front()).map(|one| one.sample)
+}
+
+fn wait<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, sample: T, since_ns: u64, dropped: &mut u64) {
+    if waiting.len() == MAX_WAITING {
+        waiting.pop_front();
+        *dropped += 1;
+    }
+    waiting.push_back(Waiting { boot: header.boot, seq: header.seq, since_ns, sample });
+}
+
+/// Returns the number of dropped samples.
+fn expire<T>(waiting: &mut VecDeque<Waiting<T>>, now_ns: u64) -> u64 {
+    let is_old = |one: &&Waiting<T>| now_ns.saturating_sub(one.since_ns) > SILENCE_NS;
+    let old = waiting.iter().take_while(is_old).count();
+    waiting.drain(..old);
+    old as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header(boot: u64, seq: u64) -> Header {
+        Header { boot, seq, ..Header::default() }
+    }
+
+    #[test]
+    fn pairs_samples_whichever_arrives_first() {
+        let mut join = Join::default();
+        assert_eq!(join.second(&header(1, 4), 'b', 0), None);
+        assert_eq!(join.first(&header(1, 4), 'a', 1), Some(('a', 'b')));
+        // Many of one topic, and then many of the other one.
+        (5..37).for_each(|seq| assert_eq!(join.first(&header(1, seq), 'a', 2), None));
+        (5..37).for_each(|seq| assert_eq!(join.second(&header(1, seq), 'b', 3), Some(('a', 'b'))));
+        assert_eq!((join.dropped(), join.first.len() + join.second.len()), (0, 0));
+    }
+
+    #[test]
+    fn sample_without_partner_is_dropped_when_the_next_partner_arrives() {
+        let mut join = Join::default();
+        for seq in 1..=3 {
+            assert_eq!(join.first(&header(1, seq), seq, 0), None);
+        }
+        assert_eq!(join.second(&header(1, 3), 30, 0), Some((3, 30)));
+        assert_eq!(join.dropped(), 2);
+        assert_eq!(join.first(&header(1, 4), 4, 0), None);
+        assert_eq!(join.second(&header(1, 5), 50, 0), None);
+        assert_eq!((join.dropped(), join.first.len(), join.second.len()), (3, 0, 1));
+        assert_eq!(join.first(&header(1, 5), 5, 0), Some((5, 50)));
+    }
+
+    #[test]
+    fn samples_of_two_runs_are_no_pair() {
+        let mut join = Join::default();
+        assert_eq!(join.first(&header(1, 7), 'a', 0), None);
+        assert_eq!(join.first(&header(2, 0), 'c', 0), None);
+        assert_eq!(join.second(&header(2, 7), 'x', 0), None);
+        assert_eq!(join.second(&header(1, 7), 'b', 0), Some(('a', 'b')), "the hub was restarted in between");
+        assert_eq!(join.dropped(), 0);
+        assert_eq!(join.first(&header(2, 7), 'y', 0), Some(('y', 'x')));
+    }
+
+    #[test]
+    fn samples_of_a_silent_topic_are_dropped_by_time_and_number() {
+        let mut join = Join::<u64, u64>::default();
+        join.first(&header(1, 1), 1, 0);
+        join.first(&header(1, 2), 2, 10);
+        join.expire(SILENCE_NS);
+        assert_eq!(join.dropped(), 0);
+        join.expire(SILENCE_NS + 1);
+        assert_eq!((join.dropped(), join.first.len()), (1, 1));
+        for seq in 3..3 + MAX_WAITING as u64 {
+            join.first(&header(1, seq), seq, 20);
+        }
+        assert_eq!((join.dropped(), join.first.len()), (2, MAX_WAITING));
+    }
+}
