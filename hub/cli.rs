@@ -19,10 +19,7 @@ mod probe;
 pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
-mod site;
 mod telegram;
-mod tilt;
-mod track;
 pub(crate) mod watch;
 mod web;
 mod zones;
@@ -33,6 +30,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use scanhub_config::Sources;
+use scanhub_perception::verbs::{SiteArgs, TiltArgs, TrackArgs};
 use scanhub_schema::{Failure, Family};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 use scanhub_verbs::{Bounds, duration};
@@ -53,10 +51,7 @@ pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
-pub(crate) use site::Site;
 pub(crate) use telegram::{Telegram, Way};
-pub(crate) use tilt::Tilt;
-pub(crate) use track::Track;
 pub(crate) use watch::Watch;
 pub(crate) use web::Web;
 pub(crate) use zones::Zones;
@@ -179,11 +174,11 @@ pub(crate) enum Verb {
     /// Learn which part of a sensor's view is the robot itself
     Zones(Zones),
     /// Follow people across the sensors and rooms of a site, and count them at doors
-    Track(Track),
+    Track(TrackArgs),
     /// 3D from a tilting scanner: points, background, obstacles
-    Tilt(Tilt),
+    Tilt(TiltArgs),
     /// Check and draw the plan of sensors, rooms and doors that people are followed in
-    Site(Site),
+    Site(SiteArgs),
     /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),

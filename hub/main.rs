@@ -67,6 +67,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
     // Without the standard library's buffer, which cuts at line feeds: one write is one sample, a raw one too.
     let stdout = io::stdout().as_fd().try_clone_to_owned().map(File::from);
     let mut out = stdout.map_err(|error| Failure::new(Kind::Failed, format!("no stdout: {error}"), ""))?;
+    let (json, mut notes) = (everywhere.json, io::stderr());
     match &cli.verb {
         Verb::Run(run) => run_hub(run, everywhere),
         Verb::Replay(replay) => replay::replay(replay, everywhere),
@@ -173,19 +174,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             scanhub_verbs::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
-        Verb::Track(track) => scanhub_perception::verbs::track(
-            &track.options(everywhere)?,
-            &mut out,
-            &mut io::stderr(),
-            &*interrupt()?,
-        ),
-        Verb::Tilt(tilt) => scanhub_perception::verbs::tilt(
-            &tilt.options(everywhere)?,
-            &mut out,
-            &mut io::stderr(),
-            &*interrupt()?,
-        ),
-        Verb::Site(site) => site.run(everywhere.json),
+        Verb::Track(track) => track.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
+        Verb::Tilt(tilt) => tilt.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
+        Verb::Site(site) => site.run(json, &mut out),
         Verb::Leds(leds) => {
             scanhub_verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }

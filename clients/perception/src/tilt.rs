@@ -1,31 +1,448 @@
-//! Three dimensions with a planar scanner that a mount tilts: its scans and the mount's angles become points, sweep by sweep,
-//! and what stands before the learned background, or near the robot, becomes obstacles. No clock and no I/O: time is that of
-//! the stamps, so a recording gives the same at any speed.
+//! Computes three dimensions with a planar scanner that a mount tilts: points, background and obstacles, sweep by sweep.
 //!
-//! [`Mount`] is where the axis is; [`Tilting`] takes scans and [`Angle`]s and hands out [`Sweep`]s. An angle that cannot be
-//! trusted makes no points; [`Counts`] say how many were withheld, and why.
+//! A [`Mount`] describes the axis. [`TiltScanner`] takes scans and [`Angle`]s and returns [`Sweep`]s. Each beam gets the
+//! mount's angle at its own time. A beam without a reliable angle makes no point; [`Counts`] has the number of such beams by
+//! reason.
+//!
+//! There is neither clock nor I/O here. Time is that of the stamps, so a recording gives the same points at any speed.
 
 mod angles;
 mod background;
-mod check;
 mod delay;
 mod mount;
-mod obstacles;
-mod scenery;
-mod settings;
 mod sweep;
-mod swing;
-mod tilting;
+
+use std::collections::VecDeque;
+
+use scanhub_schema::Scan;
+pub use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
+use serde::{Serialize, Serializer};
+
+pub use self::angles::{Angle, Withheld};
+use self::angles::{AngleLookup, AngleUpdate, Angles, ReversalDetector, SwingEvent};
+use self::delay::{Delay, MOST_S};
+pub use self::mount::{Check, Floor, Mount, Wall};
+use self::sweep::{Ray, SweepAnalyzer};
 
 /// The examples of the page.
 #[cfg(doctest)]
 #[doc = include_str!("../../../docs/tilt.md")]
 struct Page;
 
-pub use angles::{Angle, Withheld};
-pub use check::{Check, Floor, Wall};
-pub use mount::Mount;
-pub use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
-pub use settings::Settings;
-pub use sweep::{Point, Sweep};
-pub use tilting::{Counts, Tilting};
+/// Maximum number of scans that wait for angles. One more makes the scanner take the oldest at once.
+const WAITING: usize = 64;
+/// Maximum number of beams of a sweep. It then ends without a reversal.
+const RAYS: usize = 262_144;
+/// Difference from the last stamp at which a clock is taken to have been set back.
+const JUMP_NS: u64 = 1_000_000_000;
+/// Counters since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Counts {
+    /// Sweeps that were returned.
+    pub sweeps: u64,
+    /// Returned sweeps that are not complete.
+    pub incomplete: u64,
+    /// Returned sweeps that contradict the background.
+    pub doubted: u64,
+    /// Resets of the background, because scans changed or sweeps contradicted it for too long.
+    pub forgotten: u64,
+    /// Scans that were taken.
+    pub scans: u64,
+    /// Scans that were dropped because later ones had arrived.
+    pub unordered: u64,
+    /// Points that were made.
+    pub points: u64,
+    /// Beams with a reading that made no point, by [`Withheld`].
+    #[serde(serialize_with = "by_reason")]
+    pub withheld: [u64; Withheld::COUNT],
+    /// Angles that were taken.
+    pub angles: u64,
+    /// Angles that were dropped because later ones had arrived.
+    pub angles_unordered: u64,
+    /// Angles that were dropped because their stamps are later than all scans.
+    pub angles_ahead: u64,
+    /// Angles that were dropped because they are not numbers.
+    pub angles_unfit: u64,
+}
+
+fn by_reason<S: Serializer>(counts: &[u64; Withheld::COUNT], serializer: S) -> Result<S::Ok, S::Error> {
+    use Withheld::{Inconsistent, Jumped, Silent, Standing};
+    serializer.collect_map([Silent, Jumped, Inconsistent, Standing].into_iter().zip(counts))
+}
+
+struct Waiting {
+    stamp_ns: u64,
+    /// Stamp of the last beam.
+    until_ns: u64,
+    scan: Box<Scan>,
+}
+
+/// End of a sweep.
+#[derive(Clone, Copy)]
+struct End {
+    stamp_ns: u64,
+    /// Whether the mount reversed. Otherwise its angle is unknown from here on.
+    is_turn: bool,
+}
+
+/// A scanner on a mount.
+pub struct TiltScanner {
+    settings: Settings,
+    angles: Angles,
+    reversals: ReversalDetector,
+    waiting: VecDeque<Waiting>,
+    spare: Vec<Box<Scan>>,
+    /// Stamp of the last scan.
+    scan_ns: Option<u64>,
+    /// Stamp of the last beam that was taken.
+    taken_ns: u64,
+    ends: VecDeque<End>,
+    rays: Vec<Ray>,
+    later: Vec<Ray>,
+    analyzer: SweepAnalyzer,
+    delay: Delay,
+    /// Number of beams, first angle and step of the scans.
+    shape: (usize, f64, f64),
+    from_ns: u64,
+    /// Whether the sweep started at a reversal, and no beam is missing so far.
+    is_whole: bool,
+    counts: Counts,
+}
+
+impl TiltScanner {
+    /// Creates a scanner without scans and angles.
+    pub fn new(mount: Mount, settings: Settings) -> TiltScanner {
+        TiltScanner {
+            settings,
+            angles: Angles::new(),
+            reversals: ReversalDetector::default(),
+            waiting: VecDeque::with_capacity(WAITING + 1),
+            spare: Vec::new(),
+            scan_ns: None,
+            taken_ns: 0,
+            ends: VecDeque::new(),
+            rays: Vec::new(),
+            later: Vec::new(),
+            analyzer: SweepAnalyzer::new(mount, settings),
+            delay: Delay::default(),
+            shape: (0, 0.0, 0.0),
+            from_ns: 0,
+            is_whole: false,
+            counts: Counts::default(),
+        }
+    }
+
+    /// Returns the counters.
+    pub fn counts(&self) -> Counts {
+        Counts { forgotten: self.analyzer.forgotten, ..self.counts }
+    }
+
+    /// Returns the estimated delay of the stamps of the mount in ns, by which all angles are corrected. It follows
+    /// from the difference of up and down sweeps.
+    pub fn late_ns(&self) -> i64 {
+        self.angles.late_ns()
+    }
+
+    /// Returns the reason why beams that are measured now make no points. `None` if they do.
+    pub fn trouble(&self) -> Option<Withheld> {
+        let late_ns = self.scan_ns.unwrap_or(0).saturating_sub(self.settings.delay_ns);
+        let is_silent = self.angles.last_ns().is_none_or(|last_ns| last_ns < late_ns);
+        if is_silent { Some(Withheld::Silent) } else { self.angles.trouble() }
+    }
+
+    /// Takes the next angle, and passes each complete sweep to `show`.
+    pub fn take_angle(&mut self, angle: Angle, mut show: impl FnMut(&Sweep<'_>)) {
+        let before_ns = self.angles.last_ns();
+        match self.angles.take(angle, self.scan_ns, &self.settings, &mut self.counts) {
+            AngleUpdate::Dropped => return,
+            AngleUpdate::Torn => {
+                self.reversals.forget();
+                if self.angles.trouble() == Some(Withheld::Jumped) {
+                    self.analyzer.distrust();
+                }
+                self.interrupt_sweep(before_ns.unwrap_or(self.angles.true_ns(angle.stamp_ns)));
+            }
+            AngleUpdate::On => match self.reversals.take(angle.stamp_ns, angle.angle_rad, &self.settings) {
+                SwingEvent::Nothing => {}
+                SwingEvent::Turned(stamp_ns) => {
+                    self.ends.push_back(End { stamp_ns: self.angles.true_ns(stamp_ns), is_turn: true });
+                }
+                SwingEvent::Stands(stamp_ns) => {
+                    self.angles.stand_since(stamp_ns);
+                    let since_ns = self.angles.true_ns(stamp_ns);
+                    let before = self.rays.len();
+                    self.rays.retain(|ray| ray.time_ns <= since_ns);
+                    self.counts.withheld[Withheld::Standing as usize] += (before - self.rays.len()) as u64;
+                    self.interrupt_sweep(since_ns);
+                }
+            },
+        }
+        self.counts.angles += 1;
+        self.advance(&mut show);
+    }
+
+    /// Takes the next scan with its header's first stamp, and passes each complete sweep to `show`.
+    pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
+        if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
+            if last_ns - stamp_ns < JUMP_NS {
+                self.counts.unordered += 1;
+                return;
+            }
+            self.reset();
+        }
+        self.fit(scan);
+        self.scan_ns = Some(stamp_ns);
+        let mut copy = self.spare.pop().unwrap_or_else(|| scan.boxed());
+        Scan::grow(&mut copy, scan.bytes().len());
+        copy.copy_from(scan.bytes());
+        let times = (0..scan.beams()).map(|beam| stamp_ns.saturating_add_signed(scan.beam_ns(beam)));
+        self.waiting.push_back(Waiting { stamp_ns, until_ns: times.max().unwrap_or(stamp_ns), scan: copy });
+        self.advance(&mut show);
+    }
+
+    /// Restarts after the clock was set back.
+    fn reset(&mut self) {
+        self.spare.extend(self.waiting.drain(..).map(|one| one.scan));
+        self.rays.clear();
+        self.ends.clear();
+        self.reversals.forget();
+        self.delay.forget();
+        (self.taken_ns, self.is_whole) = (0, false);
+    }
+
+    /// Restarts with a new background if the shape of the scans changes.
+    fn fit(&mut self, scan: &Scan) {
+        let shape = (scan.beams(), scan.first_angle, scan.step);
+        if shape != self.shape {
+            self.analyzer.begin(shape.0, self.shape.0 == 0);
+            self.delay.forget();
+            // Beams of the old shape have other directions.
+            self.rays.clear();
+            self.spare.extend(self.waiting.drain(..).map(|one| one.scan));
+            self.is_whole = false;
+            self.shape = shape;
+        }
+    }
+
+    /// Ends the sweep at `stamp_ns`, from which on the angle is unknown.
+    fn interrupt_sweep(&mut self, stamp_ns: u64) {
+        if self.ends.back().is_none_or(|end| end.is_turn || end.stamp_ns < stamp_ns) {
+            self.ends.push_back(End { stamp_ns, is_turn: false });
+        }
+    }
+
+    fn advance(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
+        while let Some(first) = self.waiting.front() {
+            let newest_ns = self.scan_ns.unwrap_or(first.stamp_ns);
+            let is_over = newest_ns - first.stamp_ns > self.settings.delay_ns || self.waiting.len() > WAITING;
+            if !is_over && self.angles.at(first.until_ns) == AngleLookup::Open {
+                break;
+            }
+            if let Some(one) = self.waiting.pop_front() {
+                self.look_at(&one);
+                self.spare.push(one.scan);
+            }
+            self.finish(show);
+        }
+        self.finish(show);
+    }
+
+    /// Gives the beams of a scan their angles.
+    fn look_at(&mut self, one: &Waiting) {
+        let unit_m = f64::from(one.scan.unit_um) * 1e-6;
+        for (beam, &value) in one.scan.ranges().iter().enumerate() {
+            let is_far = value == one.scan.no_return || value == one.scan.beyond;
+            let range_m = match one.scan.range(beam) {
+                Some(range) => (f64::from(range) * unit_m) as f32,
+                None if is_far => f32::INFINITY,
+                None => continue,
+            };
+            let time_ns = one.stamp_ns.saturating_add_signed(one.scan.beam_ns(beam));
+            let why = match self.angles.at(time_ns) {
+                AngleLookup::Known(angle_rad) => {
+                    let beam_rad = one.scan.angle(beam);
+                    self.rays.push(Ray { time_ns, angle_rad, beam_rad, range_m, beam: beam as u16 });
+                    continue;
+                }
+                AngleLookup::Never(why) => why,
+                AngleLookup::Open => Withheld::Silent,
+            };
+            self.is_whole = false;
+            self.counts.withheld[why as usize] += u64::from(!is_far);
+        }
+        self.counts.scans += 1;
+        self.taken_ns = self.taken_ns.max(one.until_ns);
+        if self.rays.len() > RAYS {
+            self.interrupt_sweep(self.taken_ns);
+        } else if self.angles.last_ns().is_some_and(|last_ns| last_ns < one.until_ns) {
+            // It has waited for angles that did not arrive.
+            self.interrupt_sweep(self.angles.last_ns().unwrap_or(0));
+        }
+    }
+
+    /// Ends the complete sweeps.
+    fn finish(&mut self, show: &mut impl FnMut(&Sweep<'_>)) {
+        while let Some(end) = self.ends.front().copied().filter(|end| end.stamp_ns <= self.taken_ns) {
+            self.ends.pop_front();
+            let TiltScanner { rays, later, .. } = self;
+            later.clear();
+            later.extend(rays.iter().filter(|ray| ray.time_ns > end.stamp_ns));
+            rays.retain(|ray| ray.time_ns <= end.stamp_ns);
+            let is_next_whole = self.rays.is_empty() || self.show(end, show);
+            std::mem::swap(&mut self.rays, &mut self.later);
+            (self.from_ns, self.is_whole) = (end.stamp_ns, end.is_turn && is_next_whole);
+        }
+    }
+
+    /// Adds `more_ns` to the delay of the angles' stamps, and gives the beams of this sweep and the next one their corrected
+    /// angles. Returns whether each of the two still has all beams: the angles of the first ones may be forgotten, and those of
+    /// the last ones may not have arrived.
+    fn correct(&mut self, more_ns: i64) -> [bool; 2] {
+        self.angles.correct(more_ns);
+        let TiltScanner { angles, rays, later, ends, counts, .. } = self;
+        let is_whole = [rays, later].map(|rays| {
+            let before = rays.len();
+            rays.retain_mut(|ray| match angles.at(ray.time_ns) {
+                AngleLookup::Known(angle_rad) => {
+                    ray.angle_rad = angle_rad;
+                    true
+                }
+                _ => false,
+            });
+            counts.withheld[Withheld::Silent as usize] += (before - rays.len()) as u64;
+            before == rays.len()
+        });
+        ends.iter_mut().for_each(|end| end.stamp_ns = end.stamp_ns.saturating_add_signed(-more_ns));
+        self.delay.forget();
+        self.analyzer.correct();
+        is_whole
+    }
+
+    /// Passes the sweep until `end` to `show`. Returns whether the next sweep has all beams so far.
+    fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
+        let mut is_next_whole = true;
+        let mut sweep = Sweep {
+            number: self.counts.sweeps as u32,
+            from_ns: self.from_ns,
+            until_ns: end.stamp_ns,
+            is_complete: self.is_whole && end.is_turn,
+            ..Sweep::default()
+        };
+        let span = (sweep.from_ns, sweep.until_ns);
+        if let Some(late_s) = self.delay.take(&self.rays, self.shape.0, span, sweep.is_complete) {
+            let more_ns = (late_s * 1e9) as i64;
+            let all_s = 1e-9 * (self.angles.late_ns() + more_ns) as f64;
+            if all_s.abs() < MOST_S {
+                let [is_whole, is_whole_next] = self.correct(more_ns);
+                (sweep.is_complete, is_next_whole) = (sweep.is_complete && is_whole, is_whole_next);
+            }
+        }
+        sweep.late_ns = self.angles.late_ns();
+        let sweep = self.analyzer.look(&self.rays, sweep);
+        self.counts.points += sweep.points.len() as u64;
+        self.counts.sweeps += 1;
+        self.counts.incomplete += u64::from(!sweep.is_complete);
+        self.counts.doubted += u64::from(sweep.is_doubted);
+        show(&sweep);
+        is_next_whole
+    }
+}
+
+/// End point of a beam.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Point {
+    /// Position in the robot's frame, in meters: ahead, to the left, above the floor.
+    pub at: [f32; 3],
+    /// Time of the measurement.
+    pub stamp_ns: u64,
+    /// Index of the beam in its scan.
+    pub beam: u16,
+    /// Class, compared with the background before this sweep.
+    pub class: PointClass,
+}
+
+/// The points between two reversals of the mount.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sweep<'a> {
+    /// Number of the sweep, from 0.
+    pub number: u32,
+    /// Time of its start.
+    pub from_ns: u64,
+    /// Time of its end.
+    pub until_ns: u64,
+    /// Whether it lasts from one reversal to the next, and every beam had a reliable angle.
+    pub is_complete: bool,
+    /// Whether its angles contradict the background, so that they are unreliable. All points then have class unknown,
+    /// and there are no obstacles.
+    pub is_doubted: bool,
+    /// Generation of the background that the points were compared with. Each reset increases it by 1.
+    pub generation: u32,
+    /// Delay of the angles' stamps by which its angles are corrected, in ns.
+    pub late_ns: i64,
+    /// Points in the order of their scans.
+    pub points: &'a [Point],
+    /// Obstacles, the nearest first.
+    pub obstacles: &'a [Obstacle],
+    /// Number of obstacles beyond the maximum.
+    pub left_out: u32,
+}
+
+/// Parameters for sweeps, background and obstacles.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// Maximum time for which a scan waits for the angles of its beams, in ns of the stamps.
+    pub delay_ns: u64,
+    /// Maximum time between two angles that can be interpolated, in ns.
+    pub gap_ns: u64,
+    /// Maximum speed of a mount in rad/s. A faster change is a jump of its encoder.
+    pub fastest_rad_s: f64,
+    /// Maximum difference between the speed that two angles show and the rates in their samples, in rad/s.
+    pub rate_rad_s: f64,
+    /// Time without a jump after which angles are reliable again, in ns.
+    pub settle_ns: u64,
+    /// Minimum change of the angle in the other direction that makes a reversal, in radians.
+    pub turn_rad: f64,
+    /// The mount stands if its angle changes by less than a tenth of [`turn_rad`](Self::turn_rad) in this time, in
+    /// ns.
+    pub standing_ns: u64,
+    /// Width of a cell of the background, in radians of the mount's angle.
+    pub bin_rad: f64,
+    /// Minimum distance of foreground from the background, in meters.
+    pub threshold_m: f64,
+    /// Sweeps in which a surface must be seen before it is background.
+    pub sweeps: u16,
+    /// Maximum share of the known background that may be elsewhere in a sweep. More contradicts its angles.
+    pub doubt: f64,
+    /// Maximum error of the angles in a part of a sweep that the floor shows, in radians. More contradicts the
+    /// angles.
+    pub off_rad: f64,
+    /// Minimum number of points of an obstacle.
+    pub points: usize,
+    /// Width of the cubes that connect the points of an obstacle, in meters.
+    pub cube_m: f64,
+    /// Box in which every object is an obstacle, even if it is background: minimum and maximum x, y and z in the
+    /// robot's frame.
+    pub near: Option<[[f64; 2]; 3]>,
+}
+
+impl Default for Settings {
+    fn default() -> Settings {
+        Settings {
+            delay_ns: 300_000_000,
+            gap_ns: 100_000_000,
+            fastest_rad_s: 180_f64.to_radians(),
+            rate_rad_s: 10_f64.to_radians(),
+            settle_ns: 500_000_000,
+            turn_rad: 2_f64.to_radians(),
+            standing_ns: 400_000_000,
+            bin_rad: 1_f64.to_radians(),
+            threshold_m: 0.06,
+            sweeps: 5,
+            doubt: 0.3,
+            off_rad: 0.25_f64.to_radians(),
+            points: 8,
+            cube_m: 0.15,
+            near: None,
+        }
+    }
+}

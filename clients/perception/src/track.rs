@@ -1,23 +1,506 @@
-//! People, across sensors and rooms: from what stands before the background of several sensors to persons with an identity.
-//! No clock, and no I/O but the site file: time is that of the samples, in `wall_ns`, so a recording gives the same tracks
-//! at any speed.
+//! Tracks people across the sensors and rooms of a site, from the foregrounds of several sensors to people with an identity.
 //!
-//! [`Site`] is where sensors, rooms and doors are; [`People`] takes scans with their foregrounds and makes [`Picture`]s.
+//! A [`Site`] describes sensors, rooms and doors. [`PeopleTracker`] takes scans with their foregrounds and returns
+//! [`Picture`]s: the tracks at one time, and the events before it. It takes the scans of all sensors in the order of their
+//! stamps, with a bounded wait for the latest, and estimates the offsets between the clocks that stamped them.
+//!
+//! There is neither clock nor I/O here. Time is that of the samples (`wall_ns`), so a recording gives the same tracks at any
+//! speed.
 
 mod assignment;
-mod filter;
 pub mod geometry;
-mod order;
 mod passage;
 mod person;
-mod picture;
-mod poses;
-mod sight;
+mod pose_check;
+mod sensor_view;
 pub mod site;
 mod tracker;
 
-pub use order::{Counts, People};
-pub use picture::{Event, Kind, Misplaced, Picture, Track};
-pub use sight::LEGS;
-pub use site::Site;
-pub use tracker::{PERSONS, PICTURE_NS};
+use std::collections::VecDeque;
+
+use scanhub_schema::{EventKind, Foreground, Pose, Scan, TrackSensor, TrackState, Tracks};
+use serde::Serialize;
+
+use self::geometry::Point;
+pub use self::sensor_view::LEGS;
+use self::site::Sensor;
+pub use self::site::Site;
+use self::tracker::Tracker;
+pub use self::tracker::{PERSONS, PICTURE_NS};
+
+/// Maximum number of waiting scans of a sensor. One more makes the tracker take the oldest at once.
+const WAITING: usize = 64;
+/// Difference from all other stamps at which a clock is taken to have jumped.
+const JUMP_NS: u64 = 2_000_000_000;
+/// After this number of such stamps in a row, they are the time.
+const JUMPS: u32 = 50;
+/// Share of an offset that one correction removes.
+const GAIN: f64 = 0.05;
+/// Minimum weight of the observations before an offset is corrected, in (m/s)2.
+const ENOUGH: f64 = 40.0;
+/// Maximum offset between the clocks of two hubs.
+const MOST_OFFSET_NS: f64 = 250e6;
+
+/// Counters since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Counts {
+    /// Scans that were taken.
+    pub scans: u64,
+    /// Scans that were dropped because they arrived after the delay.
+    pub late: u64,
+    /// Scans that were dropped because their stamp is seconds away from all others.
+    pub jumped: u64,
+    /// Scans that were dropped because their foreground has other beams, or because their sensor is not in the site.
+    pub unfit: u64,
+}
+
+struct Waiting {
+    /// As stamped. It is corrected when the scan is taken.
+    wall_ns: u64,
+    scan: Box<Scan>,
+    foreground: Box<Foreground>,
+}
+
+/// Tracks people with the scans of a site's sensors.
+pub struct PeopleTracker {
+    tracker: Tracker,
+    delay_ns: u64,
+    /// Scans of each sensor in the order of their stamps.
+    queues: Vec<VecDeque<Waiting>>,
+    /// Hub of each sensor, as the index of the hub's first sensor.
+    hub_of: Vec<usize>,
+    /// Offset of each hub's clock from the clock of the first hub, in ns. The index is that of the hub's first
+    /// sensor.
+    offsets: Vec<f64>,
+    /// Latest stamp.
+    latest_ns: u64,
+    /// Stamp of the last scan that was taken.
+    taken_ns: u64,
+    next_picture_ns: u64,
+    jumps: u32,
+    counts: Counts,
+    /// Late scans of each sensor.
+    late: Vec<u64>,
+    picture: Picture,
+    spare: Vec<Waiting>,
+}
+
+impl PeopleTracker {
+    /// Creates a tracker that waits for late scans for `delay_ns`.
+    pub fn new(site: Site, delay_ns: u64) -> PeopleTracker {
+        let hub_of = site
+            .sensors
+            .iter()
+            .map(|one| site.sensors.iter().position(|other| other.hub() == one.hub()).unwrap_or_default());
+        let hub_of: Vec<usize> = hub_of.collect();
+        let count = site.sensors.len();
+        PeopleTracker {
+            tracker: Tracker::new(site),
+            delay_ns,
+            queues: (0..count).map(|_| VecDeque::with_capacity(WAITING)).collect(),
+            hub_of,
+            offsets: vec![0.0; count],
+            latest_ns: 0,
+            taken_ns: 0,
+            next_picture_ns: 0,
+            jumps: 0,
+            counts: Counts::default(),
+            late: vec![0; count],
+            picture: Picture::default(),
+            spare: Vec::new(),
+        }
+    }
+
+    /// Returns the site.
+    pub fn site(&self) -> &Site {
+        &self.tracker.site
+    }
+
+    /// Returns the counters.
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// Returns the number of late scans of each sensor, by its index in the site. The sum is [`Counts::late`].
+    pub fn late(&self) -> &[u64] {
+        &self.late
+    }
+
+    /// Returns the estimated offset of the clock that stamps `sensor` from the first sensor's clock, in seconds. It
+    /// follows from people whom both sensors see.
+    pub fn offset_s(&self, sensor: usize) -> f64 {
+        self.hub_of.get(sensor).map_or(0.0, |&hub| self.offsets[hub] * 1e-9)
+    }
+
+    /// Takes a scan of `sensor`, an index in the site, with its foreground and its stamp of the wall clock. Passes
+    /// each picture that is due to `show`. Scans that arrive within the delay are taken in the order of their stamps.
+    pub fn take(
+        &mut self,
+        sensor: usize,
+        wall_ns: u64,
+        scan: &Scan,
+        foreground: &Foreground,
+        mut show: impl FnMut(&Picture),
+    ) {
+        if sensor >= self.queues.len() || usize::from(foreground.count) != scan.beams() || scan.beams() == 0 {
+            self.counts.unfit += 1;
+            return;
+        }
+        let at_ns = self.corrected(sensor, wall_ns);
+        if self.latest_ns > 0 && at_ns.abs_diff(self.latest_ns) > JUMP_NS && !self.is_new_time(at_ns) {
+            self.counts.jumped += 1;
+            return;
+        }
+        if at_ns <= self.taken_ns {
+            self.counts.late += 1;
+            self.late[sensor] += 1;
+            return;
+        }
+        self.jumps = 0;
+        self.latest_ns = self.latest_ns.max(at_ns);
+        let mut one = self.spare.pop().unwrap_or_else(|| Waiting {
+            wall_ns,
+            scan: scan.boxed(),
+            foreground: foreground.boxed(),
+        });
+        one.wall_ns = wall_ns;
+        Scan::grow(&mut one.scan, scan.bytes().len());
+        Foreground::grow(&mut one.foreground, foreground.bytes().len());
+        one.scan.copy_from(scan.bytes());
+        one.foreground.copy_from(foreground.bytes());
+        let queue = &mut self.queues[sensor];
+        let place = queue.partition_point(|other| other.wall_ns <= wall_ns);
+        queue.insert(place, one);
+        let until_ns = self.latest_ns.saturating_sub(self.delay_ns);
+        self.advance(until_ns, &mut show);
+    }
+
+    /// Takes all waiting scans, at the end of a recording.
+    pub fn finish(&mut self, mut show: impl FnMut(&Picture)) {
+        self.advance(u64::MAX, &mut show);
+    }
+
+    /// Converts a stamp of `sensor` to the clock of the first sensor.
+    fn corrected(&self, sensor: usize, wall_ns: u64) -> u64 {
+        wall_ns.saturating_add_signed(-(self.offsets[self.hub_of[sensor]] as i64))
+    }
+
+    fn advance(&mut self, until_ns: u64, show: &mut impl FnMut(&Picture)) {
+        loop {
+            let first = |sensor: usize, queue: &VecDeque<Waiting>| {
+                queue.front().map(|one| self.corrected(sensor, one.wall_ns))
+            };
+            let fronts = self.queues.iter().enumerate().filter_map(|(i, queue)| Some((first(i, queue)?, i)));
+            let Some((at_ns, sensor)) = fronts.min() else { break };
+            let is_full = self.queues.iter().any(|queue| queue.len() > WAITING);
+            if at_ns > until_ns && !is_full {
+                break;
+            }
+            // A corrected clock may step back.
+            let at_ns = at_ns.max(self.taken_ns + 1);
+            if self.next_picture_ns == 0 {
+                self.next_picture_ns = (at_ns / PICTURE_NS + 1) * PICTURE_NS;
+            }
+            self.pictures_until(at_ns, show);
+            if let Some(one) = self.queues[sensor].pop_front() {
+                self.tracker.take(sensor, at_ns, &one.scan, &one.foreground);
+                self.spare.push(one);
+                self.counts.scans += 1;
+                self.taken_ns = at_ns;
+                self.compare_clocks();
+            }
+        }
+        // No scan that may still arrive changes these.
+        if until_ns < u64::MAX && self.next_picture_ns > 0 && self.next_picture_ns <= until_ns {
+            self.pictures_until(until_ns + 1, show);
+            self.taken_ns = self.taken_ns.max(self.next_picture_ns - PICTURE_NS);
+        }
+    }
+
+    /// Passes the pictures before `at_ns` to `show`.
+    fn pictures_until(&mut self, at_ns: u64, show: &mut impl FnMut(&Picture)) {
+        if at_ns.saturating_sub(self.next_picture_ns) > JUMP_NS {
+            self.next_picture_ns = (at_ns / PICTURE_NS) * PICTURE_NS;
+        }
+        while self.next_picture_ns < at_ns {
+            self.tracker.show(self.next_picture_ns, &mut self.picture);
+            show(&self.picture);
+            self.next_picture_ns += PICTURE_NS;
+        }
+    }
+
+    /// Counts a stamp that is far from the time so far. Returns whether the clock has been set: then all stamps are.
+    fn is_new_time(&mut self, at_ns: u64) -> bool {
+        self.jumps += 1;
+        let is_new = self.jumps > JUMPS;
+        if is_new {
+            self.jumps = 0;
+            self.latest_ns = at_ns;
+            self.taken_ns = at_ns - 1;
+            self.next_picture_ns = 0;
+            self.queues.iter_mut().for_each(VecDeque::clear);
+        }
+        is_new
+    }
+
+    /// Estimates the offsets of the clocks: a sensor whose clock is late sees a walking person ahead of the expected
+    /// position, and one whose clock is early sees them behind it.
+    fn compare_clocks(&mut self) {
+        for (sensor, &hub) in self.hub_of.iter().enumerate() {
+            if hub == 0 || hub != sensor {
+                continue;
+            }
+            let sum = |is_of: &dyn Fn(usize) -> bool| {
+                let all = self.tracker.lateness.iter().zip(&self.hub_of).filter(|(_, hub)| is_of(**hub));
+                all.fold((0.0, 0.0), |sum, ((a, b), _)| (sum.0 + a, sum.1 + b))
+            };
+            let (own, others) = (sum(&|of| of == hub), sum(&|of| of == 0));
+            if own.1 < ENOUGH || others.1 < ENOUGH {
+                continue;
+            }
+            let ahead_s = own.0 / own.1 - others.0 / others.1;
+            let gain = GAIN;
+            self.offsets[hub] =
+                (self.offsets[hub] - gain * 1e9 * ahead_s * FEEDBACK).clamp(-MOST_OFFSET_NS, MOST_OFFSET_NS);
+            for (of, lateness) in self.hub_of.iter().zip(&mut self.tracker.lateness) {
+                if *of == hub || *of == 0 {
+                    *lateness = (0.0, 0.0);
+                }
+            }
+        }
+    }
+}
+
+/// Factor for the offset that shows. The filter follows each sensor in part, so only a part of the offset shows.
+const FEEDBACK: f64 = 3.0;
+
+/// A person at one time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Track {
+    /// ID of the track. It is never used again.
+    pub id: u64,
+    /// State of the track.
+    pub state: TrackState,
+    /// Middle between the legs, in meters in the map.
+    pub place: Point,
+    /// Velocity in m/s.
+    pub velocity: Point,
+    /// Covariance of the position in m2: xx, xy, yy.
+    pub covariance: [f64; 3],
+    /// Index of the room in the site.
+    pub room: Option<usize>,
+    /// Sensors that see the person, as bits by their index in the site.
+    pub sensors: u32,
+    /// Seconds since the person was first seen.
+    pub age_s: f64,
+    /// Confidence that this is a person, 0 to 1.
+    pub score: f64,
+}
+
+/// Kind of an event.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Kind {
+    /// The person is confirmed.
+    Appeared,
+    /// The person is no longer tracked.
+    Left,
+    /// The person went through a door from room to room. `None` is outside.
+    Door {
+        /// Index of the door in the site.
+        door: usize,
+        /// The room that the person left.
+        from: Option<usize>,
+        /// The room that the person entered.
+        to: Option<usize>,
+    },
+}
+
+/// An event.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Event {
+    /// Time in ns since 1970.
+    pub wall_ns: u64,
+    /// ID of the person's track.
+    pub id: u64,
+    /// Index of the room that the person is in after the event.
+    pub room: Option<usize>,
+    /// Kind of the event.
+    pub kind: Kind,
+}
+
+/// A sensor that is not at its position in the site, compared with another one that sees the same people. The tracker
+/// corrects its position from then on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Misplaced {
+    /// Index of the sensor in the site.
+    pub sensor: usize,
+    /// Index of the other sensor.
+    pub other: usize,
+    /// Offset of the people that it sees from those that the other one sees, in meters in the map.
+    pub off: Point,
+}
+
+/// All people at one time, and the events since the last picture.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Picture {
+    /// Time of all positions, in ns since 1970.
+    pub wall_ns: u64,
+    /// Tracks by ID.
+    pub tracks: Vec<Track>,
+    /// Events in their order.
+    pub events: Vec<Event>,
+    /// Sensors that were found misplaced since the last picture.
+    pub misplaced: Vec<Misplaced>,
+}
+
+impl Picture {
+    /// Returns the picture as it is published, with the names in `site`.
+    pub fn payload(&self, site: &Site) -> Tracks {
+        let mut tracks = Tracks::default();
+        site.sensors.iter().for_each(|sensor| tracks.push_sensor(sensor.payload()));
+        self.tracks.iter().for_each(|track| tracks.push(track.payload(site)));
+        tracks
+    }
+}
+
+impl Sensor {
+    fn payload(&self) -> TrackSensor {
+        let [x_m, y_m] = self.place;
+        let upside_down = u8::from(self.is_upside_down);
+        let pose = Pose { x_m, y_m, yaw_rad: self.yaw_rad, upside_down, ..Pose::default() };
+        TrackSensor::new(&self.name, &pose)
+    }
+}
+
+impl Track {
+    fn payload(&self, site: &Site) -> scanhub_schema::Track {
+        let mut track = scanhub_schema::Track {
+            id: self.id,
+            x_m: self.place[0] as f32,
+            y_m: self.place[1] as f32,
+            vx_m_s: self.velocity[0] as f32,
+            vy_m_s: self.velocity[1] as f32,
+            covariance: self.covariance.map(|value| value as f32),
+            score: self.score as f32,
+            age_ms: (1000.0 * self.age_s) as u32,
+            sensors: self.sensors,
+            state: self.state as u8,
+            ..scanhub_schema::Track::default()
+        };
+        track.set_room(self.room.and_then(|room| site.rooms.get(room)).map_or("", |room| &room.name));
+        track
+    }
+}
+
+impl Event {
+    /// Returns the event as it is published, with the names in `site`.
+    pub fn payload(&self, site: &Site) -> scanhub_schema::Event {
+        let room = self.room.and_then(|room| site.rooms.get(room)).map(|room| room.name.as_str());
+        let of = |kind| scanhub_schema::Event::new(kind, self.id, room);
+        match self.kind {
+            Kind::Appeared => of(EventKind::Appeared),
+            Kind::Left => of(EventKind::Left),
+            Kind::Door { door, from, to } => {
+                let name = site.doors.get(door).map_or("", |door| &door.name);
+                of(EventKind::Door).through(name, site.room_name(from), site.room_name(to))
+            }
+        }
+    }
+}
+
+const _: () = assert!(PERSONS == scanhub_schema::TRACKS && site::SENSORS == scanhub_schema::TRACK_SENSORS);
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use scanhub_preprocess::background::{Model, Settings};
+    use scanhub_schema::ScanHead;
+
+    use super::*;
+
+    const ROOM: &str = r#"
+[[sensor]]
+name = "front"
+pose = { x = 0.1, y = 3.0, yaw = 0.0 }
+[[room]]
+name = "hall"
+polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
+"#;
+    const BEAMS: usize = 361;
+    const SCANS: usize = 75;
+
+    fn capacity(people: &PeopleTracker) -> usize {
+        let queues: usize = people.queues.iter().map(VecDeque::capacity).sum();
+        let picture = people.picture.tracks.capacity() + people.picture.events.capacity();
+        people.tracker.capacity() + queues + people.spare.capacity() + picture
+    }
+
+    /// A scan of a sensor that sees a wall 3 m around it, and two legs around a beam 2 m before it.
+    fn scan(legs: Option<usize>) -> Box<Scan> {
+        let head = ScanHead {
+            first_angle: -std::f64::consts::FRAC_PI_2,
+            step: std::f64::consts::PI / 360.0,
+            unit_um: 1000,
+            valid_to: 8182,
+            no_return: 8191,
+            beyond: 8191,
+            ..ScanHead::default()
+        };
+        let is_leg = |beam: usize| legs.is_some_and(|middle| (3..=8).contains(&beam.abs_diff(middle)));
+        let words: Vec<u16> = (0..BEAMS).map(|beam| if is_leg(beam) { 2000 } else { 3000 }).collect();
+        Scan::of(head, &words)
+    }
+
+    #[test]
+    fn memory_does_not_grow_and_no_identity_comes_again_however_many_come_and_go() {
+        let site = Site::parse("room.toml", ROOM).expect("a room");
+        let mut people = PeopleTracker::new(site, 80_000_000);
+        let mut model = Model::new(Settings::default(), BEAMS);
+        let (mut foreground, mut now_ns) = (Foreground::of(BEAMS), 1_700_000_000_000_000_000);
+        let (mut gone, mut here) = (BTreeSet::new(), BTreeSet::new());
+        let mut turn = |people: &mut PeopleTracker, legs: Option<usize>| {
+            let scan = scan(legs);
+            model.update(&scan, &mut foreground);
+            now_ns += PICTURE_NS;
+            people.take(0, now_ns, &scan, &foreground, |picture| {
+                let now: BTreeSet<u64> = picture.tracks.iter().map(|track| track.id).collect();
+                gone.extend(here.difference(&now).copied());
+                assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
+                here = now;
+            });
+        };
+        (0..300).for_each(|_| turn(&mut people, None));
+        let mut visit = |people: &mut PeopleTracker, number: usize| {
+            // 40 of 75 scans show a person who walks by. Their track is deleted before the next person comes.
+            for i in 0..SCANS {
+                turn(people, (i < 40).then_some(60 + number % 100 + 3 * i));
+            }
+        };
+        // Every path once.
+        (0..100).for_each(|number| visit(&mut people, number));
+        let begin = capacity(&people);
+        (100..300).for_each(|number| visit(&mut people, number));
+        assert_eq!(capacity(&people), begin);
+        assert!(gone.len() >= 200, "{}", gone.len());
+        assert_eq!(people.counts().late, 0);
+    }
+
+    #[test]
+    fn a_picture_comes_as_soon_as_nothing_before_it_is_waited_for() {
+        const MS: u64 = 1_000_000;
+        const BEGIN: u64 = 1_700_000_000_000_000_000;
+        let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM).expect("a room"), 80 * MS);
+        let (scan, foreground) = (scan(None), Foreground::of(BEAMS));
+        let mut take = |after_ms: u64| {
+            let mut pictures = Vec::new();
+            let show = |picture: &Picture| pictures.push((picture.wall_ns - BEGIN) / MS);
+            people.take(0, BEGIN + after_ms * MS, &scan, &foreground, show);
+            (pictures, people.counts().late)
+        };
+        assert_eq!([take(0), take(100)], [(vec![], 0), (vec![], 0)]);
+        assert_eq!(take(200), (vec![40, 80, 120], 0));
+        assert_eq!(take(110), (vec![], 1), "a picture that was shown holds");
+        assert_eq!(take(240), (vec![160], 1));
+    }
+}

@@ -1,30 +1,16 @@
-//! The verbs that subscribe to scans, and print and publish the results of [`track`](mod@crate::track) and
-//! [`tilt`](mod@crate::tilt).
+//! The verbs of this crate: each has a struct with its arguments, and `run`. They subscribe to a hub, and print and publish the
+//! results of [`track`](mod@crate::track) and [`tilt`](mod@crate::tilt).
 
+mod results;
+mod site;
 mod tilt;
 mod track;
 
-use std::path::Path;
+pub use site::SiteArgs;
+pub use tilt::TiltArgs;
+pub use track::TrackArgs;
 
-use scanhub_files::regular;
-use scanhub_schema::{Failure, Kind};
-
-use crate::track::Site;
-
-pub use tilt::{TiltOptions, tilt};
-pub use track::{TrackOptions, track};
-
-impl Site {
-    /// Reads the site file at `path`.
-    ///
-    /// # Errors
-    ///
-    /// Returns [`Kind::Input`] if the file cannot be read, and the errors of [`Site::parse`].
-    pub fn read(path: &Path) -> Result<Site, Failure> {
-        let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
-            let message = format!("{}: {error}", path.display());
-            Failure::new(Kind::Input, message, "name a readable site file; docs/tracks.md has one")
-        })?;
-        Site::parse(&path.display().to_string(), &text)
-    }
+/// Parses a name that topics are published under. A sensor may have it, too.
+fn own_name(name: &str) -> Result<String, String> {
+    scanhub_schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
 }

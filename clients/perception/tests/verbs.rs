@@ -3,12 +3,17 @@
 #[path = "../../client/tests/fake/mod.rs"]
 mod fake;
 
-use std::time::Duration;
+use std::ffi::OsStr;
 
+use clap::Parser;
 use fake::{FakeHub, Place, Verb, until};
-use scanhub_perception::track::Site;
-use scanhub_perception::verbs::{TrackOptions, track};
-use scanhub_verbs::Bounds;
+use scanhub_perception::verbs::TrackArgs;
+
+#[derive(Parser)]
+struct Arguments {
+    #[command(flatten)]
+    track: TrackArgs,
+}
 
 const SITE: &str = r#"
 [[sensor]]
@@ -29,16 +34,11 @@ const RANGES: [u16; 4] = [300; 4];
 fn reported(json: bool, text: &str) -> (String, String) {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 7);
-    let options = TrackOptions {
-        site: Site::parse("site.toml", SITE).unwrap(),
-        name: None,
-        count: Vec::new(),
-        delay: Duration::from_millis(80),
-        json,
-        bounds: Bounds::default(),
-        places: place.places(),
-    };
-    let verb = Verb::start(move |out, notes, stop| track(&options, out, notes, stop));
+    let site = place.base.join("site.toml");
+    std::fs::write(&site, SITE).unwrap();
+    let args = Arguments::parse_from([OsStr::new("track"), OsStr::new("--site"), site.as_os_str()]).track;
+    let places = place.places();
+    let verb = Verb::start(move |out, notes, stop| args.run(json, &places, out, notes, stop));
     for sensor in &hub.sensors {
         sensor.scan.await_subscribers(1);
         sensor.foreground.await_subscribers(1);

@@ -203,6 +203,11 @@ fn perception_only_computes() {
             tree.with(&format!("clients/perception/src/{path}"), &format!("//! So.\n{code}\n"))
         };
         vec![
+            tree.with_line(
+                "clients/perception/Cargo.toml",
+                "[dependencies]",
+                "scanhub-drivers.workspace = true",
+            ),
             tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
             planted("tilt/planted.rs", "use std::time::Instant;"),
             planted("tilt.rs", "let now = scanhub_client::clock::now_ns();"),

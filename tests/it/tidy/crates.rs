@@ -358,7 +358,21 @@ pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
         "scanhub_verbs",
         "crate::verbs",
     ];
-    let mut breaches = lacks(tree, "clients/perception/src/lib.rs", &["#![forbid(unsafe_code)]"]);
+    const KNOWN: [&str; 11] = [
+        "clap",
+        "nalgebra",
+        "pathfinding",
+        "scanhub-client",
+        "scanhub-files",
+        "scanhub-schema",
+        "scanhub-shm",
+        "scanhub-verbs",
+        "serde",
+        "strsim",
+        "toml",
+    ];
+    let mut breaches = built_of(tree, "scanhub-perception", &KNOWN);
+    breaches.extend(lacks(tree, "clients/perception/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     for module in ["tilt", "track"] {
         let (file, folder) =
             (format!("clients/perception/src/{module}.rs"), format!("clients/perception/src/{module}/"));

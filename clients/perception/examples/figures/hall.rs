@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use scanhub_perception::tilt::{Angle, Counts, Mount, Point, Settings, Sweep, Tilting};
+use scanhub_perception::tilt::{Angle, Counts, Mount, Point, Settings, Sweep, TiltScanner};
 use scanhub_schema::{Scan, ScanHead};
 use scanhub_sim::mount::{Mount as Motor, Report};
 use scanhub_sim::room::BeamTarget;
@@ -46,7 +46,7 @@ impl Hall {
         until_s: u64,
         mut show: impl FnMut(&Hall, &Sweep<'_>),
     ) -> Counts {
-        let mut tilting = Tilting::new(self.mount, settings);
+        let mut tilting = TiltScanner::new(self.mount, settings);
         let until_ns = until_s * 1_000_000_000;
         let numbers = 0..(until_s as f64 * self.motor.reports_hz) as u64;
         let mut reports: Vec<Report> = numbers.filter_map(|number| self.motor.report(number)).collect();
@@ -71,7 +71,7 @@ impl Hall {
         let numbers = 0..(until_s as f64 * self.motor.reports_hz) as u64;
         let reports: Vec<Report> = numbers.filter_map(|number| self.motor.report(number)).collect();
         let play = |_| {
-            let mut tilting = Tilting::new(self.mount, settings);
+            let mut tilting = TiltScanner::new(self.mount, settings);
             let mut reports = reports.iter().peekable();
             let began = Instant::now();
             for (end_ns, scan) in ends.iter().zip(&scans) {

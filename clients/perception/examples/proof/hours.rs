@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use scanhub_perception::track::{People, Picture, Site};
+use scanhub_perception::track::{PeopleTracker, Picture, Site};
 use scanhub_preprocess::background::{Model, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan};
@@ -34,7 +34,7 @@ pub(crate) fn run(hours: u64, people: usize) {
         })
         .collect();
     let sensors = eyes.len() as u64;
-    let mut tracker = People::new(site, DELAY_NS);
+    let mut tracker = PeopleTracker::new(site, DELAY_NS);
     let mut ids = Identities::default();
     let mut held: Option<(usize, u64, Box<Scan>, Box<Foreground>)> = None;
     let (mut sent_late, mut tracker_s) = (0, 0.0);

@@ -4,7 +4,7 @@ use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
 
 use scanhub_perception::track::geometry::{Point, distance, distance_to_border};
-use scanhub_perception::track::{Kind, People, Picture, Site};
+use scanhub_perception::track::{Kind, PeopleTracker, Picture, Site};
 use scanhub_preprocess::background::{Model, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::TrackState;
@@ -89,7 +89,7 @@ pub(crate) fn run(setup: Setup) -> Outcome {
     let drift = 50e-6 * (2.0 * random.f64() - 1.0);
     let phases: Vec<f64> = (0..sensors).map(|_| random.f64() / RATE_HZ).collect();
     let mut crowd = Crowd::new(setup.house, setup.people, EMPTY_S, (setup.restless, setup.sits), setup.seed);
-    let mut people = People::new(site.clone(), 80_000_000);
+    let mut people = PeopleTracker::new(site.clone(), 80_000_000);
     let mut nearest = Nearest::new(site.clone());
     let mut outcome = Outcome { simulated_s: setup.seconds, ..Outcome::default() };
     let mut truths: Vec<Vec<Point>> = Vec::new();

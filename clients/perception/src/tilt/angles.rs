@@ -1,128 +1,124 @@
-//! The mount's angle at any time, from what its encoder says now and then; and where that cannot be trusted. Refuses to know
-//! beams and sweeps.
+//! The mount's angle at any time, interpolated between the angles that its encoder reports; the times at which it is not
+//! reliable; and the reversals of the mount.
 
 use std::collections::VecDeque;
 
-use crate::tilt::settings::Settings;
+use serde::Serialize;
 
-/// What an encoder, or whatever turns the mount, says.
+use super::{Counts, Settings};
+
+/// An angle that the encoder or drive of the mount reports.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Angle {
-    /// CLOCK_MONOTONIC when the mount was there, not when that was said.
+    /// Time of the measurement in CLOCK_MONOTONIC, not of the report.
     pub stamp_ns: u64,
-    /// In radians, as [`Mount`](crate::tilt::Mount) counts them.
+    /// Angle in radians, in the direction that [`Mount`](super::Mount) defines.
     pub angle_rad: f64,
-    /// How fast it grows in radians a second; nan: not known.
+    /// Rate of change in rad/s. NaN: unknown.
     pub rate_rad_s: f64,
 }
 
-/// Why beams make no points.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Reason why a beam makes no point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 #[repr(usize)]
 pub enum Withheld {
-    /// No angle was said for that time, or it came too late.
+    /// No angle was reported for that time, or it arrived too late.
     Silent,
-    /// The angle jumped, or has jumped not long ago.
+    /// The angle jumps, or has jumped recently.
     Jumped,
-    /// The angles are not those that their rates say.
+    /// The angles contradict their rates.
     Inconsistent,
-    /// The mount stands, or its encoder hangs: from the angles both look alike.
+    /// The mount stands, or its encoder hangs. Both look the same.
     Standing,
 }
 
 impl Withheld {
-    /// How many reasons there are.
+    /// Number of reasons.
     pub const COUNT: usize = 4;
 }
 
-/// What is known of the angle at a time.
+/// The angle at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum At {
+pub(crate) enum AngleLookup {
     Known(f64),
-    /// No later angle has come yet.
+    /// No later angle has arrived yet.
     Open,
     Never(Withheld),
 }
 
-/// What an angle means for the way that the mount takes.
+/// Effect of a new angle.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Step {
-    /// It was not taken.
+pub(crate) enum AngleUpdate {
+    /// The angle was dropped.
     Dropped,
-    /// The mount came here.
+    /// The mount moved to this angle.
     On,
-    /// From the angle before to this one nothing is known.
+    /// The angles between the last one and this one are unknown.
     Torn,
-}
-
-/// What was wrong with angles, since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Dropped {
-    pub(crate) unordered: u64,
-    pub(crate) ahead: u64,
-    pub(crate) unfit: u64,
 }
 
 #[derive(Clone, Copy)]
 struct Entry {
     angle: Angle,
-    /// Why the way from the angle before to this one is not known.
+    /// Reason why the angles between the last one and this one are unknown.
     torn: Option<Withheld>,
 }
 
-/// The last angles.
+/// The most recent angles.
 pub(crate) struct Angles {
     entries: VecDeque<Entry>,
     settled_ns: u64,
-    /// Time from each angle to its stamp.
+    /// Estimated delay of all stamps.
     late_ns: i64,
-    pub(crate) dropped: Dropped,
 }
 
-/// So many are kept: ten seconds of 100 a second.
+/// Maximum number of stored angles: ten seconds at 100 Hz.
 const ANGLES: usize = 1024;
-/// A stamp so far before all others is of a clock that was set back; one so far ahead of the scans of none.
+/// Difference from other stamps at which a clock is taken to have been set back, or from scans at which an angle is
+/// dropped.
 const JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
     pub(crate) fn new() -> Angles {
-        Angles {
-            entries: VecDeque::with_capacity(ANGLES),
-            settled_ns: 0,
-            late_ns: 0,
-            dropped: Dropped::default(),
-        }
+        Angles { entries: VecDeque::with_capacity(ANGLES), settled_ns: 0, late_ns: 0 }
     }
 
-    /// Takes the next angle; the latest scan is of `scan_ns`, if there was one.
-    pub(crate) fn take(&mut self, angle: Angle, scan_ns: Option<u64>, settings: &Settings) -> Step {
+    /// Takes the next angle. The latest scan is from `scan_ns`.
+    pub(crate) fn take(
+        &mut self,
+        angle: Angle,
+        scan_ns: Option<u64>,
+        settings: &Settings,
+        counts: &mut Counts,
+    ) -> AngleUpdate {
         if !angle.angle_rad.is_finite() {
-            self.dropped.unfit += 1;
-            return Step::Dropped;
+            counts.angles_unfit += 1;
+            return AngleUpdate::Dropped;
         }
         if scan_ns.is_some_and(|scan_ns| angle.stamp_ns > scan_ns.saturating_add(JUMP_NS)) {
-            self.dropped.ahead += 1;
-            return Step::Dropped;
+            counts.angles_ahead += 1;
+            return AngleUpdate::Dropped;
         }
         let Some(before) = self.entries.back().map(|entry| entry.angle) else {
             self.entries.push_back(Entry { angle, torn: Some(Withheld::Silent) });
-            return Step::Torn;
+            return AngleUpdate::Torn;
         };
         if angle.stamp_ns <= before.stamp_ns {
-            self.dropped.unordered += 1;
+            counts.angles_unordered += 1;
             if before.stamp_ns - angle.stamp_ns > JUMP_NS {
                 self.entries.clear();
                 self.entries.push_back(Entry { angle, torn: Some(Withheld::Silent) });
-                return Step::Torn;
+                return AngleUpdate::Torn;
             }
-            return Step::Dropped;
+            return AngleUpdate::Dropped;
         }
         let torn = self.torn(&before, &angle, settings);
         if self.entries.len() == ANGLES {
             self.entries.pop_front();
         }
         self.entries.push_back(Entry { angle, torn });
-        if torn.is_some() { Step::Torn } else { Step::On }
+        if torn.is_some() { AngleUpdate::Torn } else { AngleUpdate::On }
     }
 
     fn torn(&mut self, before: &Angle, angle: &Angle, settings: &Settings) -> Option<Withheld> {
@@ -137,14 +133,14 @@ impl Angles {
         if angle.stamp_ns <= self.settled_ns {
             return Some(Withheld::Jumped);
         }
-        // Where the mount turns back the rates are apart, and the way is between them.
+        // At a reversal, the rates differ, and the speed is between them.
         let (least, most) =
             (before.rate_rad_s.min(angle.rate_rad_s), before.rate_rad_s.max(angle.rate_rad_s));
         let is_off = speed < least - settings.rate_rad_s || speed > most + settings.rate_rad_s;
         is_off.then_some(Withheld::Inconsistent)
     }
 
-    /// Marks all angles after the one with the stamp `since_ns`: the mount stands.
+    /// Marks all angles after the one with the stamp `since_ns` as standing.
     pub(crate) fn stand_since(&mut self, since_ns: u64) {
         let stands = |entry: &&mut Entry| entry.angle.stamp_ns > since_ns && entry.torn.is_none();
         self.entries
@@ -164,36 +160,109 @@ impl Angles {
         self.late_ns += more_ns;
     }
 
-    /// Returns when the mount was where an angle with the stamp `stamp_ns` says.
+    /// Returns the time at which the mount had the angle with the stamp `stamp_ns`.
     pub(crate) fn true_ns(&self, stamp_ns: u64) -> u64 {
         stamp_ns.saturating_add_signed(-self.late_ns)
     }
 
-    /// Returns when the mount was at the last angle.
+    /// Returns the time at which the mount had the last angle.
     pub(crate) fn last_ns(&self) -> Option<u64> {
         self.entries.back().map(|entry| self.true_ns(entry.angle.stamp_ns))
     }
 
-    /// Returns why the way to the last angle is not known.
+    /// Returns the reason why the angles before the last one are unknown.
     pub(crate) fn trouble(&self) -> Option<Withheld> {
         self.entries.back().map_or(Some(Withheld::Silent), |entry| entry.torn)
     }
 
-    /// Returns the angle at `time_ns`, evenly between those before and after.
-    pub(crate) fn at(&self, time_ns: u64) -> At {
+    /// Returns the angle at `time_ns`, interpolated between those before and after.
+    pub(crate) fn at(&self, time_ns: u64) -> AngleLookup {
         let time_ns = time_ns.saturating_add_signed(self.late_ns);
         let after = self.entries.partition_point(|entry| entry.angle.stamp_ns < time_ns);
-        let Some(Entry { angle, torn }) = self.entries.get(after) else { return At::Open };
+        let Some(Entry { angle, torn }) = self.entries.get(after) else { return AngleLookup::Open };
         let Some(before) = after.checked_sub(1).map(|i| self.entries[i].angle) else {
-            return At::Never(Withheld::Silent);
+            return AngleLookup::Never(Withheld::Silent);
         };
         match torn {
-            Some(why) => At::Never(*why),
+            Some(why) => AngleLookup::Never(*why),
             None => {
                 let share = (time_ns - before.stamp_ns) as f64 / (angle.stamp_ns - before.stamp_ns) as f64;
-                At::Known(before.angle_rad + share * (angle.angle_rad - before.angle_rad))
+                AngleLookup::Known(before.angle_rad + share * (angle.angle_rad - before.angle_rad))
             }
         }
+    }
+}
+
+/// Event that an angle shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum SwingEvent {
+    Nothing,
+    /// The mount reversed at this time.
+    Turned(u64),
+    /// The mount has been standing since this time.
+    Stands(u64),
+}
+
+/// An angle with its stamp.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Place {
+    stamp_ns: u64,
+    rad: f64,
+}
+
+/// Direction in which the mount moves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Direction {
+    /// Unknown, with the minimum and maximum angle since then.
+    Open { least: Place, most: Place },
+    /// To larger angles, with the maximum so far.
+    Up(Place),
+    /// To smaller angles, with the minimum so far.
+    Down(Place),
+}
+
+/// Detects the reversals of a mount, and whether it stands. Thanks to a hysteresis, play of the gears is neither.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct ReversalDetector {
+    direction: Option<Direction>,
+    /// Last angle at which it moved.
+    moved: Option<Place>,
+}
+
+impl ReversalDetector {
+    /// Resets the detector.
+    pub(crate) fn forget(&mut self) {
+        *self = ReversalDetector::default();
+    }
+
+    /// Takes the next angle.
+    pub(crate) fn take(&mut self, stamp_ns: u64, rad: f64, settings: &Settings) -> SwingEvent {
+        use Direction::{Down, Open, Up};
+        use SwingEvent::{Nothing, Turned};
+        let here = Place { stamp_ns, rad };
+        let moved = *self.moved.get_or_insert(here);
+        if (rad - moved.rad).abs() > settings.turn_rad / 10.0 {
+            self.moved = Some(here);
+        } else if stamp_ns - moved.stamp_ns > settings.standing_ns {
+            self.direction = None;
+            return SwingEvent::Stands(moved.stamp_ns);
+        }
+        let back = settings.turn_rad;
+        let (direction, event) = match self.direction.unwrap_or(Open { least: here, most: here }) {
+            Open { least, .. } if rad > least.rad + back => (Up(here), Nothing),
+            Open { most, .. } if rad < most.rad - back => (Down(here), Nothing),
+            Open { least, most } => {
+                let least = if rad <= least.rad { here } else { least };
+                let most = if rad >= most.rad { here } else { most };
+                (Open { least, most }, Nothing)
+            }
+            Up(most) if rad < most.rad - back => (Down(here), Turned(most.stamp_ns)),
+            Up(most) => (Up(if rad >= most.rad { here } else { most }), Nothing),
+            Down(least) if rad > least.rad + back => (Up(here), Turned(least.stamp_ns)),
+            Down(least) => (Down(if rad <= least.rad { here } else { least }), Nothing),
+        };
+        self.direction = Some(direction);
+        event
     }
 }
 
@@ -203,77 +272,118 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    fn angles(said: &[(u64, f64)]) -> (Angles, Vec<Step>) {
-        let mut angles = Angles::new();
+    fn angles(said: &[(u64, f64)]) -> (Angles, Vec<AngleUpdate>, Counts) {
+        let (mut angles, mut counts) = (Angles::new(), Counts::default());
         let settings = Settings::default();
         let steps = said.iter().map(|&(ms, deg)| {
             let angle = Angle { stamp_ns: ms * MS, angle_rad: f64::to_radians(deg), rate_rad_s: f64::NAN };
-            angles.take(angle, Some(1000 * MS), &settings)
+            angles.take(angle, Some(1000 * MS), &settings, &mut counts)
         });
         let steps = steps.collect();
-        (angles, steps)
+        (angles, steps, counts)
     }
 
     fn deg(angles: &Angles, ms: u64) -> Option<f64> {
         match angles.at(ms * MS) {
-            At::Known(rad) => Some((rad.to_degrees() * 1e6).round() / 1e6),
+            AngleLookup::Known(rad) => Some((rad.to_degrees() * 1e6).round() / 1e6),
             _ => None,
         }
     }
 
     #[test]
     fn between_two_angles_it_goes_evenly() {
-        let (angles, steps) = angles(&[(10, 1.0), (20, 2.0), (40, 1.0)]);
-        assert_eq!(steps, [Step::Torn, Step::On, Step::On]);
+        let (angles, steps, _) = angles(&[(10, 1.0), (20, 2.0), (40, 1.0)]);
+        assert_eq!(steps, [AngleUpdate::Torn, AngleUpdate::On, AngleUpdate::On]);
         assert_eq!([15, 20, 30, 40].map(|ms| deg(&angles, ms)), [1.5, 2.0, 1.5, 1.0].map(Some));
-        assert_eq!((angles.at(9 * MS), angles.at(41 * MS)), (At::Never(Withheld::Silent), At::Open));
+        assert_eq!(
+            (angles.at(9 * MS), angles.at(41 * MS)),
+            (AngleLookup::Never(Withheld::Silent), AngleLookup::Open)
+        );
     }
 
     #[test]
     fn a_silence_and_a_jump_are_no_way() {
-        let (silent, _) = angles(&[(10, 1.0), (20, 2.0), (200, 3.0), (210, 4.0)]);
-        assert_eq!(silent.at(100 * MS), At::Never(Withheld::Silent));
+        let (silent, ..) = angles(&[(10, 1.0), (20, 2.0), (200, 3.0), (210, 4.0)]);
+        assert_eq!(silent.at(100 * MS), AngleLookup::Never(Withheld::Silent));
         assert_eq!(deg(&silent, 205), Some(3.5));
         let said: Vec<_> = (0..80).map(|i| (10 * i, if i < 5 { 0.0 } else { 8.0 })).collect();
-        let (jumped, steps) = angles(&said);
-        assert_eq!(jumped.at(45 * MS), At::Never(Withheld::Jumped));
-        assert_eq!(jumped.at(300 * MS), At::Never(Withheld::Jumped), "not settled");
+        let (jumped, steps, _) = angles(&said);
+        assert_eq!(jumped.at(45 * MS), AngleLookup::Never(Withheld::Jumped));
+        assert_eq!(jumped.at(300 * MS), AngleLookup::Never(Withheld::Jumped), "not settled");
         assert_eq!(deg(&jumped, 600), Some(8.0));
-        assert_eq!(steps.iter().filter(|step| **step == Step::On).count(), 4 + 80 - 5 - 51);
+        assert_eq!(steps.iter().filter(|step| **step == AngleUpdate::On).count(), 4 + 80 - 5 - 51);
     }
 
     #[test]
     fn stamps_that_cannot_be_are_dropped_and_counted() {
-        let (angles, steps) =
+        let (angles, steps, counts) =
             angles(&[(1500, 1.0), (1490, 1.0), (2100, 1.0), (1510, 2.0), (100, 3.0), (110, 4.0)]);
-        use Step::{Dropped as D, On, Torn};
+        use AngleUpdate::{Dropped as D, On, Torn};
         assert_eq!(steps, [Torn, D, D, On, Torn, On]);
-        assert_eq!(angles.dropped, Dropped { unordered: 2, ahead: 1, unfit: 0 });
+        assert_eq!((counts.angles_unordered, counts.angles_ahead, counts.angles_unfit), (2, 1, 0));
         assert_eq!(deg(&angles, 105), Some(3.5), "the clock was set back");
     }
 
     #[test]
-    fn rates_that_say_something_else_are_told() {
+    fn contradicting_rates_are_detected() {
         let settings = Settings::default();
         let mut angles = Angles::new();
         let mut say = |ms: u64, deg: f64, deg_s: f64| {
             let angle =
                 Angle { stamp_ns: ms * MS, angle_rad: deg.to_radians(), rate_rad_s: deg_s.to_radians() };
-            angles.take(angle, None, &settings)
+            angles.take(angle, None, &settings, &mut Counts::default())
         };
         assert_eq!(
             [say(0, 0.0, 30.0), say(10, 0.3, 30.0), say(20, 0.1, -30.0)],
-            [Step::Torn, Step::On, Step::On]
+            [AngleUpdate::Torn, AngleUpdate::On, AngleUpdate::On]
         );
-        assert_eq!([say(30, -0.2, 30.0), say(40, -0.5, 30.0)], [Step::On, Step::Torn]);
-        assert_eq!(angles.at(35 * MS), At::Never(Withheld::Inconsistent));
+        assert_eq!([say(30, -0.2, 30.0), say(40, -0.5, 30.0)], [AngleUpdate::On, AngleUpdate::Torn]);
+        assert_eq!(angles.at(35 * MS), AngleLookup::Never(Withheld::Inconsistent));
     }
 
     #[test]
     fn what_stands_is_marked_back_to_where_it_stood_still() {
-        let (mut angles, _) = angles(&[(10, 1.0), (20, 2.0), (30, 2.0), (40, 2.0)]);
+        let (mut angles, ..) = angles(&[(10, 1.0), (20, 2.0), (30, 2.0), (40, 2.0)]);
         angles.stand_since(20 * MS);
         assert_eq!(deg(&angles, 15), Some(1.5));
-        assert_eq!(angles.at(25 * MS), At::Never(Withheld::Standing));
+        assert_eq!(angles.at(25 * MS), AngleLookup::Never(Withheld::Standing));
+    }
+
+    fn events(degrees: impl Iterator<Item = f64>) -> Vec<SwingEvent> {
+        let mut swing = ReversalDetector::default();
+        let settings = Settings::default();
+        let events =
+            degrees.enumerate().map(|(i, deg)| swing.take(10 * i as u64 * MS, deg.to_radians(), &settings));
+        events.filter(|event| *event != SwingEvent::Nothing).collect()
+    }
+
+    /// To and fro by 20 degrees in a second, with a play of half a degree.
+    fn triangle(i: u32) -> f64 {
+        let phase = f64::from(i % 200) / 100.0;
+        20.0 * if phase < 1.0 { phase } else { 2.0 - phase } + if i.is_multiple_of(2) { 0.25 } else { -0.25 }
+    }
+
+    #[test]
+    fn it_turns_where_the_angle_was_farthest() {
+        let turns = events((0..500).map(triangle));
+        let times: Vec<u64> = turns
+            .iter()
+            .map(|event| match event {
+                SwingEvent::Turned(ns) => ns / MS,
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(times.len(), 4, "where it began may be anywhere: {times:?}");
+        for (time, expected) in times.iter().zip([1000, 2000, 3000, 4000]) {
+            assert!(time.abs_diff(expected) <= 20, "{times:?}");
+        }
+    }
+
+    #[test]
+    fn it_stands_when_the_angle_does() {
+        let stands = events((0..200).map(|i| f64::from(i.min(100)) * 0.3));
+        let SwingEvent::Stands(since) = stands[0] else { panic!("{stands:?}") };
+        assert_eq!(since / MS, 1000);
+        assert!(stands[1..].iter().all(|event| *event == SwingEvent::Stands(since)), "as long as it does");
     }
 }

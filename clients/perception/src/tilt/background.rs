@@ -1,44 +1,44 @@
-//! The background in three dimensions: for each beam in each narrow span of the mount's angle, how far it reaches always. It
-//! is learned by the paper's method: what is met in enough sweeps in a row replaces what was. Refuses to know time.
+//! The background in three dimensions: for each beam in each narrow span of the mount's angle, the surface that it usually
+//! reaches. It is learned as in two dimensions: a surface that is met in enough sweeps in a row replaces the one before.
 
 use scanhub_schema::PointClass;
 
-use crate::tilt::mount::Mount;
-use crate::tilt::settings::Settings;
+use super::Settings;
+use super::mount::Mount;
 
-/// A beam as it was measured.
+/// A measured beam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Reading {
-    /// Number of the beam.
+    /// Index of the beam.
     pub(crate) beam: u16,
-    /// Height that the beam gains with each metre, -1 to 1.
+    /// Height that the beam gains with each meter, -1 to 1.
     pub(crate) rise: f32,
-    /// How much more of it a radian more of the mount's angle makes.
+    /// Change of the rise per radian of the mount's angle.
     pub(crate) turn: f32,
-    /// Metres; infinite if nothing came back.
+    /// Range in meters. Infinite without a return.
     pub(crate) range_m: f32,
 }
 
-/// A reading that stands for a surface.
+/// A surface, represented by one reading.
 #[derive(Clone, Copy, Default)]
 struct Surface {
-    /// 0: there is none.
+    /// 0 without a surface.
     range_m: f32,
     rise: f32,
-    /// How far beams ended from where they would on a level surface, and on an upright one: mean squares, the last ones most.
+    /// Mean squared differences of beams from a level surface, and from an upright one. The last ones weigh most.
     off: [f32; 2],
 }
 
 #[derive(Clone, Copy, Default)]
 struct Cell {
     background: Surface,
-    /// What may become the background.
+    /// Surface that may become the background.
     candidate: Surface,
-    /// Sweeps in a row in which the candidate was met.
+    /// Number of sweeps in a row that met the candidate.
     run: u16,
     /// Surfaces that beams meet now and then, because they are narrower than the distance between two scans.
     narrow: [Narrow; NARROW],
-    /// The sweep in which it was looked at last, and one: once a sweep is enough.
+    /// Number of the last sweep that it was updated in, plus 1. Only one reading of a sweep counts.
     seen: u32,
 }
 
@@ -54,23 +54,23 @@ struct Narrow {
     missed: u16,
 }
 
-/// What stands always.
+/// The background of all beams.
 pub(crate) struct Model {
     beams: usize,
     /// Number of sweeps in which a surface must be met until it is background.
     sweeps: u16,
-    /// By angle; those that the mount never came to have no memory.
+    /// Cells by the mount's angle. Rows that it has not reached have no memory.
     rows: Box<[Box<[Cell]>]>,
 }
 
 impl Model {
-    /// A model that knows nothing, of a mount that turns by a quarter to each side of level at most.
+    /// Creates an empty model, for a mount that tilts by at most 90 degrees to each side of level.
     pub(crate) fn new(beams: usize, settings: &Settings) -> Model {
         let rows = (std::f64::consts::PI / width_rad(settings)).ceil() as usize + 1;
         Model { beams, sweeps: settings.sweeps, rows: (0..rows).map(|_| Box::default()).collect() }
     }
 
-    /// Compares with the model as it is.
+    /// Returns the class of a reading, compared with the model.
     pub(crate) fn class(&self, reading: &Reading, row: usize, threshold_m: f32) -> PointClass {
         let beam = usize::from(reading.beam);
         let own = self.background(row, beam);
@@ -78,7 +78,7 @@ impl Model {
         if own.as_ref().is_some_and(explains) {
             return PointClass::Background;
         }
-        // At edges a beam meets what its neighbours meet.
+        // At edges a beam meets the surfaces of its neighbors.
         let beside = || {
             let rows = row.saturating_sub(1)..=row + 1;
             rows.flat_map(|row| (beam.saturating_sub(1)..=beam + 1).map(move |beam| (row, beam)))
@@ -100,13 +100,14 @@ impl Model {
         }
     }
 
-    /// Whether the background of the reading's own cell is known.
+    /// Returns whether the background of the reading's own cell is known.
     pub(crate) fn knows(&self, reading: &Reading, row: usize) -> bool {
         self.background(row, reading.beam.into()).is_some()
     }
 
-    /// How far the mount's angle is from the one at which the reading would be where the background is: of level surfaces that
-    /// are met steeply enough to tell.
+    /// Returns the error of the mount's angle that the reading shows, in radians: the difference from the angle at
+    /// which it would be on the background. `None` unless the background is a level surface that the beam meets
+    /// steeply.
     pub(crate) fn angle_off(&self, reading: &Reading, row: usize, threshold_m: f32) -> Option<f32> {
         let known = self.background(row, reading.beam.into())?;
         let [level, upright] = known.ends(reading);
@@ -236,8 +237,8 @@ impl Surface {
         self.range_m > 0.0
     }
 
-    /// Where a beam ends that rises as `reading` does, if the surface is level and keeps its height, and if it is upright and
-    /// keeps its distance over ground.
+    /// Returns the ranges of a beam that rises as `reading` does: if the surface is level and keeps its height, and
+    /// if it is upright and keeps its distance over ground.
     fn ends(&self, reading: &Reading) -> [f32; 2] {
         let Surface { range_m, rise, .. } = *self;
         let over_ground = |rise: f32| (1.0 - rise * rise).max(0.0).sqrt();
@@ -246,8 +247,8 @@ impl Surface {
         [if is_slope { range_m * rise / reading.rise } else { upright }, upright]
     }
 
-    /// Between what ranges that beam ends: what the surface was seen not to be does not count, and what is neither level nor
-    /// upright lies between.
+    /// Returns the range limits of that beam. An orientation that earlier beams have ruled out does not count. A
+    /// surface that is neither level nor upright lies between.
     fn expected(&self, reading: &Reading, threshold_m: f32) -> (f32, f32) {
         let [level, upright] = self.ends(reading);
         let most = (threshold_m / 2.0).powi(2);
@@ -258,7 +259,7 @@ impl Surface {
         }
     }
 
-    /// A beam ended on it.
+    /// Takes a beam that ended on it.
     fn meet(&mut self, reading: &Reading) {
         if reading.range_m.is_finite() {
             let ends = self.ends(reading);
@@ -285,7 +286,7 @@ const VISITS: u16 = 3;
 const MEMORY: u16 = 20;
 /// Less than a planar scanner measures exactly.
 const LEAST_BIN_RAD: f64 = 0.002;
-/// Share of the last beam in what is known of a surface.
+/// Weight of the last beam in the mean squares of a surface.
 const NEWS: f32 = 0.25;
 /// A beam goes nearly straight up or down.
 const LEAST_OVER_GROUND: f32 = 0.02;

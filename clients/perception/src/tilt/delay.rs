@@ -1,7 +1,7 @@
 //! Estimates how much later than its angles the stamps of a mount are. With late stamps, a surface is too low in sweeps one
 //! way and too high in sweeps the other way. A play of the gears looks the same.
 
-use crate::tilt::scenery::Ray;
+use super::sweep::Ray;
 
 /// Number of directions of the scanner that are compared.
 const COLUMNS: usize = 24;

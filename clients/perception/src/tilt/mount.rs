@@ -1,22 +1,24 @@
-//! Where the axis of a mount is, and where a beam ends that was measured at an angle of it. Refuses to know where the angle
-//! comes from.
+//! The geometry of a mount, and a check of its description: with the right axis, arm and level, a flat floor is level and a
+//! wall ahead is upright.
 
-/// A mount with one axis, and the scanner on it. All in the robot's frame: x ahead, y left, z up, in metres; z is 0 at the
-/// floor.
+use super::Sweep;
+
+/// A mount with one axis, and the scanner on it. Positions are in the robot's frame: x ahead, y left, z up from the
+/// floor, in meters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mount {
     /// A point of the axis.
     pub axis_at: [f64; 3],
-    /// The way of the axis, of any length but 0. Angles grow right-handed around it: around y, which is the default, a greater
-    /// angle looks farther down; around -y farther up.
+    /// Direction of the axis, of any length but 0. Angles are right-handed: around y, which is the default, a larger
+    /// angle tilts the scanner down; around -y, up.
     pub axis: [f64; 3],
-    /// The angle at which the scanner is as the following say, and measures level.
+    /// Angle at which the scanner measures level, with the position and direction below.
     pub level_rad: f64,
-    /// Where its beams come from.
+    /// Origin of its beams.
     pub sensor_at: [f64; 3],
-    /// Where it looks, counter-clockwise from ahead.
+    /// Direction of the scanner, counterclockwise from ahead.
     pub yaw_rad: f64,
-    /// It hangs: its beams run the other way.
+    /// Whether it is mounted upside down, so that its beams run clockwise.
     pub is_upside_down: bool,
 }
 
@@ -35,22 +37,22 @@ impl Default for Mount {
 }
 
 impl Mount {
-    /// Returns the direction of the beam at `beam_rad` (0 where the scanner looks, counter-clockwise) while the mount's angle is
-    /// `angle_rad`: a unit vector.
+    /// Returns the direction of the beam at `beam_rad` (counterclockwise from the scanner's direction) while the
+    /// mount's angle is `angle_rad`: a unit vector.
     pub fn direction(&self, angle_rad: f64, beam_rad: f64) -> [f64; 3] {
         let turned = if self.is_upside_down { -beam_rad } else { beam_rad };
         let (sin, cos) = (self.yaw_rad + turned).sin_cos();
         self.turned([cos, sin, 0.0], angle_rad)
     }
 
-    /// Returns where the beams come from while the mount's angle is `angle_rad`.
+    /// Returns the origin of the beams while the mount's angle is `angle_rad`.
     pub fn origin(&self, angle_rad: f64) -> [f64; 3] {
         let arm = std::array::from_fn(|i| self.sensor_at[i] - self.axis_at[i]);
         let arm = self.turned(arm, angle_rad);
         std::array::from_fn(|i| self.axis_at[i] + arm[i])
     }
 
-    /// Returns where that beam ends, `range_m` away.
+    /// Returns the end of that beam, `range_m` away.
     pub fn point(&self, angle_rad: f64, beam_rad: f64, range_m: f64) -> [f64; 3] {
         let (origin, way) = (self.origin(angle_rad), self.direction(angle_rad, beam_rad));
         std::array::from_fn(|i| origin[i] + range_m * way[i])
@@ -74,10 +76,217 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
+/// The floor is searched up to this distance from height 0, in meters.
+const FLOOR_M: f64 = 0.4;
+/// Points farther away than this are not used: small angles move them too far.
+const FAR_M: f64 = 6.0;
+/// Points of the wall have at least this height, in meters.
+const WALL_FROM_M: f64 = 0.3;
+/// Width of the distances that are counted to find the wall, in meters.
+const BIN_M: f64 = 0.1;
+/// Fewer points make no plane.
+const ENOUGH: usize = 300;
+/// A wall is at least this high, in meters.
+const WALL_HIGH_M: f64 = 0.4;
+/// Points with a larger standard deviation are not a wall, in meters.
+const ROUGH_M: f64 = 0.07;
+/// Maximum number of points that are stored of a sweep. Each sweep has the same share, because up and down sweeps can differ.
+const POINTS: usize = 40_000;
+
+/// Points of sweeps, until they are enough.
+#[derive(Debug, Default)]
+pub struct Check {
+    points: Vec<[f64; 3]>,
+    sweeps: u32,
+    /// Delay by which the angles of these sweeps are corrected, in ns.
+    late_ns: i64,
+}
+
+/// A flat floor as the points show it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Floor {
+    /// Height of the floor at the axis, in meters. 0 if the mount is described right.
+    pub height_m: f64,
+    /// Angle in radians by which the mount looks lower than its description says.
+    pub level_rad: f64,
+    /// Angle in radians by which the floor rises to the left, apart from that.
+    pub roll_rad: f64,
+    /// Standard deviation of the points in meters.
+    pub deviation_m: f64,
+    /// Number of points.
+    pub points: usize,
+}
+
+/// A wall ahead as the points show it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Wall {
+    /// Distance from the robot's origin at the floor, in meters.
+    pub distance_m: f64,
+    /// Angle in radians by which its top is farther away than upright.
+    pub lean_rad: f64,
+    /// Standard deviation of the points in meters.
+    pub deviation_m: f64,
+    /// Number of points.
+    pub points: usize,
+}
+
+impl Check {
+    /// Takes the points of a complete sweep. If another delay corrects its angles than those of the sweeps before, the check
+    /// starts again with this sweep.
+    pub fn take(&mut self, sweep: &Sweep<'_>) {
+        if !sweep.is_complete {
+            return;
+        }
+        if sweep.late_ns != self.late_ns {
+            *self = Check { late_ns: sweep.late_ns, ..Check::default() };
+        }
+        self.sweeps += 1;
+        let points = sweep.points.iter().map(|point| point.at.map(f64::from));
+        let near = points.filter(|at| at[0].hypot(at[1]) < FAR_M);
+        let every = near.clone().count().div_ceil(POINTS).max(1);
+        self.points.extend(near.step_by(every));
+    }
+
+    /// Returns how many sweeps were taken.
+    pub fn sweeps(&self) -> u32 {
+        self.sweeps
+    }
+
+    /// Returns the floor, if there are enough points on one plane.
+    pub fn floor(&self, mount: &Mount) -> Option<Floor> {
+        let is_low = |at: &&[f64; 3]| at[2].abs() < FLOOR_M && at[0].hypot(at[1]) < FAR_M / 2.0;
+        let low = self.points.iter().filter(is_low).map(|at| ([1.0, at[0], at[1]], at[2]));
+        let plane = Plane::of(low.collect())?;
+        let [height, ahead, left] = plane.terms;
+        let [kx, ky, _] = mount.axis;
+        let square = kx * kx + ky * ky;
+        if square == 0.0 {
+            return None;
+        }
+        // A turn around the axis moves a point up by kx y - ky x for each radian.
+        let length = (square + mount.axis[2].powi(2)).sqrt();
+        let level_rad = (ahead * ky - left * kx) * length / square;
+        let roll_rad = (ahead * kx + left * ky) / square.sqrt();
+        let at_axis = height + ahead * mount.axis_at[0] + left * mount.axis_at[1];
+        Some(Floor {
+            height_m: at_axis,
+            level_rad,
+            roll_rad,
+            deviation_m: plane.deviation,
+            points: plane.points,
+        })
+    }
+
+    /// Returns the wall ahead, within 45 degrees, with the largest area.
+    pub fn wall(&self) -> Option<Wall> {
+        let high: Vec<[f64; 3]> =
+            self.points.iter().filter(|at| at[2] > WALL_FROM_M && at[0] > 0.3).copied().collect();
+        let mut best = (0.0, 0.0, 0.0);
+        for degrees in -45..=45 {
+            let way = f64::from(degrees).to_radians();
+            let mut areas = [0.0; (FAR_M / BIN_M) as usize + 2];
+            for at in &high {
+                let distance = at[0] * way.cos() + at[1] * way.sin();
+                // Points of a side wall can be behind the origin.
+                if distance >= 0.0
+                    && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
+                {
+                    // The beams diverge. Without this weight, a slice of near side walls has more points than a wall ahead.
+                    *area += at[0].powi(2) + at[1].powi(2);
+                }
+            }
+            for (bin, pair) in areas.windows(2).enumerate() {
+                if pair[0] + pair[1] > best.0 {
+                    best = (pair[0] + pair[1], way, (bin + 1) as f64 * BIN_M);
+                }
+            }
+        }
+        let (_, way, distance_m) = best;
+        let (sin, cos) = way.sin_cos();
+        let off = |at: &[f64; 3]| at[0] * cos + at[1] * sin;
+        let on: Vec<_> = high
+            .iter()
+            .filter(|at| (off(at) - distance_m).abs() < 2.0 * BIN_M)
+            .map(|at| ([1.0, at[1] * cos - at[0] * sin, at[2]], off(at)))
+            .collect();
+        let heights = on.iter().map(|(terms, _)| terms[2]);
+        let (low, top) = heights.fold((f64::INFINITY, 0.0_f64), |(low, top), z| (low.min(z), top.max(z)));
+        if top - low < WALL_HIGH_M {
+            return None;
+        }
+        let plane = Plane::of(on).filter(|plane| plane.deviation < ROUGH_M)?;
+        // The wall is not exactly across the direction in which it was found.
+        let [distance, slope, lean] = plane.terms;
+        let across = slope.hypot(1.0);
+        Some(Wall {
+            distance_m: distance / across,
+            lean_rad: (lean / across).atan(),
+            deviation_m: plane.deviation / across,
+            points: plane.points,
+        })
+    }
+}
+
+/// Terms whose sum is nearest to the values of most points.
+struct Plane {
+    terms: [f64; 3],
+    deviation: f64,
+    points: usize,
+}
+
+impl Plane {
+    /// Fits a plane by least squares; again and again without the points that are far away from it.
+    fn of(mut points: Vec<([f64; 3], f64)>) -> Option<Plane> {
+        let mut plane = None;
+        for _ in 0..8 {
+            if points.len() < ENOUGH {
+                return None;
+            }
+            let terms = solved(&points)?;
+            let off = |(a, b): &([f64; 3], f64)| b - (0..3).map(|i| a[i] * terms[i]).sum::<f64>();
+            let deviation =
+                (points.iter().map(|point| off(point).powi(2)).sum::<f64>() / points.len() as f64).sqrt();
+            plane = Some(Plane { terms, deviation, points: points.len() });
+            let most = (2.0 * deviation).max(0.02);
+            points.retain(|point| off(point).abs() < most);
+        }
+        plane
+    }
+}
+
+/// Solves the normal equations by Cramer's rule.
+fn solved(points: &[([f64; 3], f64)]) -> Option<[f64; 3]> {
+    let (mut m, mut v) = ([[0.0; 3]; 3], [0.0; 3]);
+    for (a, b) in points {
+        for i in 0..3 {
+            v[i] += a[i] * b;
+            for j in 0..3 {
+                m[i][j] += a[i] * a[j];
+            }
+        }
+    }
+    let whole = determinant(&m);
+    let is_regular = whole.abs() > 1e-9 * (m[0][0] * m[1][1] * m[2][2]).abs();
+    is_regular.then(|| {
+        std::array::from_fn(|column| {
+            let mut other = m;
+            (0..3).for_each(|row| other[row][column] = v[row]);
+            determinant(&other) / whole
+        })
+    })
+}
+
+fn determinant(m: &[[f64; 3]; 3]) -> f64 {
+    m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0])
+}
+
 #[cfg(test)]
 mod tests {
-    use super::*;
     use std::f64::consts::{FRAC_PI_2, FRAC_PI_6};
+
+    use super::*;
+    use crate::tilt::Point;
 
     fn is_near(a: [f64; 3], b: [f64; 3]) -> bool {
         (0..3).all(|i| (a[i] - b[i]).abs() < 1e-9)
@@ -108,5 +317,110 @@ mod tests {
         assert!(is_near(mount.point(0.3, 0.0, 1.0), [0.2, 1.0, 1.0]));
         assert!(is_near(mount.point(0.3, FRAC_PI_2, 1.0), [1.2, 0.0, 1.0]), "it hangs");
         assert!(is_near(mount.origin(0.3 + FRAC_PI_2), [0.1, 0.0, 0.9]));
+    }
+
+    /// Returns what a check finds in a room with a wall 3 m ahead and a box on its floor, if the mount is `real` and is described as
+    /// `told`.
+    fn found(real: &Mount, told: &Mount) -> (Floor, Wall) {
+        let mut points = Vec::new();
+        for tenth in -150..450 {
+            for beam in -60..=60 {
+                let (down, beam) = (f64::from(tenth).to_radians() / 10.0, f64::from(beam).to_radians());
+                let angle = down * real.axis[1].signum();
+                let (from, way) = (real.origin(angle), real.direction(angle, beam));
+                let to = |at: f64, axis: usize| {
+                    Some((at - from[axis]) / way[axis]).filter(|range| *range > 0.1 && way[axis].abs() > 1e-3)
+                };
+                let on_box = to(1.5, 0).filter(|range| {
+                    let [y, z] = [1, 2].map(|i| from[i] + range * way[i]);
+                    (-0.3..0.3).contains(&y) && (0.0..0.35).contains(&z)
+                });
+                let ranges = [to(0.0, 2), to(3.0, 0), on_box].into_iter().flatten();
+                let range = ranges.fold(f64::INFINITY, f64::min);
+                if range < 8.0 {
+                    let at = told.point(angle, beam, range).map(|value| value as f32);
+                    points.push(Point { at, ..Point::default() });
+                }
+            }
+        }
+        let mut check = Check::default();
+        check.take(&Sweep { points: &points, ..Sweep::default() });
+        assert_eq!(check.sweeps(), 0, "not complete");
+        check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
+        assert_eq!(check.sweeps(), 1);
+        (check.floor(told).expect("a floor"), check.wall().expect("a wall"))
+    }
+
+    #[test]
+    fn a_side_wall_behind_the_origin_is_not_a_wall_ahead() {
+        let grid =
+            |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
+        let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
+        // In a direction to the left, all of it is behind the origin.
+        let right = grid(2500).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
+        let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
+        let mut check = Check::default();
+        check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
+        let wall = check.wall().expect("a wall");
+        assert!((wall.distance_m - 3.0).abs() < 0.01, "{wall:?}");
+    }
+
+    #[test]
+    fn each_sweep_counts_whole_and_as_much_as_the_others() {
+        let points: Vec<Point> = (0..100_000_u32)
+            .map(|i| Point { at: [if i < 50_000 { 1.0 } else { 2.0 }, 0.0, 0.0], ..Point::default() })
+            .collect();
+        let mut check = Check::default();
+        for _ in 0..6 {
+            check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
+        }
+        let near = check.points.iter().filter(|at| at[0] < 1.5).count();
+        assert!(
+            near > 90_000 && near.abs_diff(check.points.len() - near) < 12,
+            "{near} of {}",
+            check.points.len()
+        );
+    }
+
+    #[test]
+    fn a_correction_starts_the_check_again_with_the_first_corrected_sweep() {
+        let points = vec![Point { at: [1.0, 0.0, 0.0], ..Point::default() }; 10];
+        let mut check = Check::default();
+        let sweeps = [0, 0, 0, 30_000_000, 30_000_000].map(|late_ns| {
+            check.take(&Sweep { points: &points, is_complete: true, late_ns, ..Sweep::default() });
+            check.sweeps()
+        });
+        assert_eq!((sweeps, check.points.len()), ([1, 2, 3, 1, 2], 20));
+    }
+
+    fn mount() -> Mount {
+        Mount { axis_at: [0.0, 0.0, 0.9], sensor_at: [0.06, 0.0, 0.94], ..Mount::default() }
+    }
+
+    #[test]
+    fn a_mount_that_is_described_right_has_a_level_floor_and_an_upright_wall() {
+        for axis in [[0.0, 1.0, 0.0], [0.0, -2.0, 0.0]] {
+            let real = Mount { axis, ..mount() };
+            let (floor, wall) = found(&real, &real);
+            assert!(floor.height_m.abs().max(floor.level_rad.abs()) < 1e-3, "{floor:?}");
+            assert!(floor.roll_rad.abs().max(wall.lean_rad.abs()) < 1e-3, "{floor:?} {wall:?}");
+            assert!((wall.distance_m - 3.0).abs() < 1e-3, "{wall:?}");
+        }
+    }
+
+    #[test]
+    fn each_error_shows_where_it_is() {
+        let real = mount();
+        let (floor, wall) = found(&real, &Mount { level_rad: 0.02, ..real });
+        assert!((floor.level_rad - 0.02).abs() < 2e-3, "{floor:?}");
+        assert!((wall.lean_rad + 0.02).abs() < 3e-3 && floor.height_m.abs() < 0.02, "{floor:?} {wall:?}");
+        let higher = Mount { axis_at: [0.0, 0.0, 0.95], sensor_at: [0.06, 0.0, 0.99], ..real };
+        let (floor, _) = found(&real, &higher);
+        assert!((floor.height_m - 0.05).abs() < 2e-3 && floor.level_rad.abs() < 2e-3, "{floor:?}");
+        let (floor, _) = found(&real, &Mount { axis: [0.0, 1.0, 0.03], ..real });
+        assert!(floor.roll_rad.abs() > 5e-3 && floor.level_rad.abs() < 5e-3, "{floor:?}");
+        // An arm that is 0.1 m too long makes the wall lean, and hardly tilts the floor.
+        let (floor, wall) = found(&real, &Mount { sensor_at: [0.06, 0.0, 1.04], ..real });
+        assert!((wall.lean_rad + floor.level_rad).abs() > 5e-3, "{floor:?} {wall:?}");
     }
 }

@@ -1,42 +1,379 @@
-//! What one way of the mount from turn to turn has shown.
+//! Classifies the points of a sweep against the background, decides whether the angles of the sweep are reliable, and finds
+//! obstacles: clusters of points in three dimensions.
 
-use scanhub_schema::{Obstacle, PointClass};
+use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
 
-/// Where a beam ended.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Point {
-    /// In the robot's frame: metres ahead, to the left, above the floor.
-    pub at: [f32; 3],
-    /// When it was measured.
-    pub stamp_ns: u64,
-    /// Number of the beam in its scan.
-    pub beam: u16,
-    /// Beside the background as it was before this sweep.
-    pub class: PointClass,
+use super::background::{Model, Reading, placed};
+use super::mount::Mount;
+use super::{Point, Settings, Sweep};
+
+/// Number of parts of a sweep whose angles are checked separately.
+const PARTS: usize = 4;
+/// Minimum number of beams on known background for a check of the angles.
+const ENOUGH: usize = 200;
+
+/// A beam with the mount's angle.
+#[derive(Clone, Copy)]
+pub(crate) struct Ray {
+    pub(crate) time_ns: u64,
+    pub(crate) angle_rad: f64,
+    pub(crate) beam_rad: f64,
+    /// Infinite without a return.
+    pub(crate) range_m: f32,
+    pub(crate) beam: u16,
 }
 
-/// The points between two turns of the mount.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sweep<'a> {
-    /// From 0.
-    pub number: u32,
-    /// When it began.
-    pub from_ns: u64,
-    /// When it ended.
-    pub until_ns: u64,
-    /// It went from one turn to the next, and nothing in between was withheld for want of an angle.
-    pub is_complete: bool,
-    /// So much of the background was not where it should be that the angles are not to be trusted: all points have class
-    /// unknown, and there are no obstacles, whatever stands there.
-    pub is_doubted: bool,
-    /// Number of the background that the points were compared with: one more each time that it was forgotten.
-    pub generation: u32,
-    /// Delay of the angles' stamps by which its angles are corrected, in ns.
-    pub late_ns: i64,
-    /// In the order of their scans.
-    pub points: &'a [Point],
-    /// What stands there, the nearest first.
-    pub obstacles: &'a [Obstacle],
-    /// Obstacles that did not fit.
-    pub left_out: u32,
+/// Background, and buffers for a sweep.
+pub(crate) struct SweepAnalyzer {
+    mount: Mount,
+    settings: Settings,
+    model: Model,
+    /// Number of resets of the model.
+    pub(crate) forgotten: u64,
+    points: Vec<Point>,
+    /// Row of the model and reading of each beam.
+    readings: Vec<(usize, Reading)>,
+    /// Error of the angle that each beam on a level surface shows.
+    off: Vec<f32>,
+    /// Points that may belong to obstacles.
+    standing: Vec<Candidate>,
+    /// Mount's angle and rise of the beam of each point.
+    beams: Vec<(f32, f32)>,
+    clusters: Clusters,
+    /// Whether the floor has been where the angles put it since their last jump.
+    is_confirmed: bool,
+    /// Number of unreliable sweeps in a row.
+    doubted: u16,
+}
+
+impl SweepAnalyzer {
+    pub(crate) fn new(mount: Mount, settings: Settings) -> SweepAnalyzer {
+        SweepAnalyzer {
+            mount,
+            settings,
+            model: Model::new(0, &settings),
+            forgotten: 0,
+            points: Vec::new(),
+            readings: Vec::new(),
+            off: Vec::new(),
+            standing: Vec::new(),
+            beams: Vec::new(),
+            clusters: Clusters::default(),
+            is_confirmed: true,
+            doubted: 0,
+        }
+    }
+
+    /// Starts with a new background for scans with this number of beams.
+    pub(crate) fn begin(&mut self, beams: usize, is_first: bool) {
+        self.model = Model::new(beams, &self.settings);
+        self.forgotten += u64::from(!is_first);
+    }
+
+    /// Marks the angles as unreliable after a jump, until the floor is where they put it.
+    pub(crate) fn distrust(&mut self) {
+        self.is_confirmed = false;
+    }
+
+    /// Forgets the background, because all angles are corrected from now on. If the last sweep contradicted the background,
+    /// the angles were right when it was learned, and it stays.
+    pub(crate) fn correct(&mut self) {
+        if self.doubted == 0 {
+            self.model.forget();
+            self.forgotten += 1;
+        }
+    }
+
+    /// Returns `sweep` with the points and obstacles of `rays`.
+    pub(crate) fn look<'a>(&'a mut self, rays: &[Ray], sweep: Sweep<'a>) -> Sweep<'a> {
+        let (known, elsewhere) = self.compare(rays);
+        let is_elsewhere = known >= ENOUGH && elsewhere as f64 > self.settings.doubt * known as f64;
+        let is_contradicted = is_elsewhere || self.is_angle_off();
+        self.is_confirmed |= !is_contradicted && self.off.len() >= ENOUGH;
+        let is_doubted = is_contradicted || !self.is_confirmed;
+        let generation = self.forgotten as u32;
+        self.standing.clear();
+        if is_doubted {
+            self.points.iter_mut().for_each(|point| point.class = PointClass::Unknown);
+            self.doubted += 1;
+        } else {
+            self.learn(sweep.number);
+            self.pick();
+            self.doubted = 0;
+        }
+        if self.doubted > 2 * self.settings.sweeps {
+            self.model.forget();
+            self.forgotten += 1;
+            (self.doubted, self.is_confirmed) = (0, true);
+        }
+        let (obstacles, left_out) =
+            self.clusters.find(&self.standing, self.settings.cube_m as f32, self.settings.points);
+        Sweep { is_doubted, generation, points: &self.points, obstacles, left_out, ..sweep }
+    }
+
+    /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number
+    /// of these that are elsewhere.
+    fn compare(&mut self, rays: &[Ray]) -> (usize, usize) {
+        self.points.clear();
+        self.readings.clear();
+        self.beams.clear();
+        self.off.clear();
+        let threshold_m = self.settings.threshold_m as f32;
+        let (mut known, mut elsewhere) = (0, 0);
+        for ray in rays {
+            let (row, reading) = ray.reading(&self.mount, &self.settings);
+            self.readings.push((row, reading));
+            let class = self.model.class(&reading, row, threshold_m);
+            self.off.extend(self.model.angle_off(&reading, row, threshold_m));
+            if self.model.knows(&reading, row) {
+                known += 1;
+                elsewhere += usize::from(class != PointClass::Background);
+            }
+            if ray.range_m.is_finite() {
+                let at = self.mount.point(ray.angle_rad, ray.beam_rad, ray.range_m.into());
+                let at = at.map(|value| value as f32);
+                self.beams.push((ray.angle_rad as f32, reading.rise));
+                self.points.push(Point { at, stamp_ns: ray.time_ns, beam: ray.beam, class });
+            }
+        }
+        (known, elsewhere)
+    }
+
+    /// Returns whether the level surfaces of the background are where they would be if the angles of a part of the sweep were
+    /// off.
+    fn is_angle_off(&mut self) -> bool {
+        let most = self.settings.off_rad as f32;
+        let part = (self.off.len() / PARTS).max(ENOUGH);
+        let is_off = |part: &mut [f32]| {
+            let middle = part.len() / 2;
+            part.select_nth_unstable_by(middle, f32::total_cmp).1.abs() > most
+        };
+        self.off.chunks_exact_mut(part).any(is_off)
+    }
+
+    fn learn(&mut self, number: u32) {
+        for (row, reading) in &self.readings {
+            self.model.learn(reading, *row, number, &self.settings);
+        }
+    }
+
+    /// Picks the points that may belong to obstacles.
+    fn pick(&mut self) {
+        let near = self.settings.near;
+        for (point, &(angle_rad, rise)) in self.points.iter().zip(&self.beams) {
+            let within = |near: &[[f64; 2]; 3]| {
+                near.iter().zip(point.at).all(|(span, value)| (span[0]..=span[1]).contains(&f64::from(value)))
+            };
+            let is_foreground = point.class == PointClass::Foreground;
+            let flags = if is_foreground { Obstacle::FOREGROUND } else { 0 }
+                | if near.as_ref().is_some_and(within) { Obstacle::NEAR } else { 0 };
+            if flags != 0 {
+                self.standing.push(Candidate { at: point.at, flags, angle_rad, rise });
+            }
+        }
+    }
+}
+
+impl Ray {
+    /// Returns the row of the background for this ray, and the reading.
+    fn reading(&self, mount: &Mount, settings: &Settings) -> (usize, Reading) {
+        placed(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
+    }
+}
+
+/// A point that can belong to an obstacle.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Candidate {
+    pub(crate) at: [f32; 3],
+    /// Flags of an obstacle with this point.
+    pub(crate) flags: u8,
+    /// Angle of the mount.
+    pub(crate) angle_rad: f32,
+    /// Height that the beam gains with each meter, -1 to 1.
+    pub(crate) rise: f32,
+}
+
+/// Obstacle with the beams that met it.
+struct Grown {
+    obstacle: Obstacle,
+    /// Lowest and highest angle of the mount.
+    angles_rad: [f32; 2],
+    /// Maximum absolute rise of the beams.
+    rise: f32,
+}
+
+impl Grown {
+    /// Returns whether a level surface, which stands always, can be all of it. Nearly level beams graze a top in few sweeps,
+    /// each time at another range, and in a span of the mount's angle that is smaller than the distance between two scans. An
+    /// object that is put down is higher.
+    fn is_grazed(&self) -> bool {
+        let [low, high] = self.angles_rad;
+        self.obstacle.flags & Obstacle::NEAR == 0 && high - low < GRAZED_RAD && self.rise < GRAZING_RISE
+    }
+}
+
+/// Span of the mount's angle in which beams graze a top: 0.4 degrees.
+const GRAZED_RAD: f32 = 0.007;
+/// Beams that rise or fall more meet a top in more than one scan.
+const GRAZING_RISE: f32 = 0.1;
+
+/// Finds obstacles: clusters of points whose cubes touch.
+#[derive(Default)]
+pub(crate) struct Clusters {
+    /// Cube and index of each point, in the order of the cubes.
+    cubes: Vec<([i16; 3], u32)>,
+    /// Whether each cube has not been reached yet, by its first point.
+    open: Vec<bool>,
+    /// Cubes at the front of the search, by their first points.
+    front: Vec<usize>,
+    found: Vec<Obstacle>,
+}
+
+impl Clusters {
+    /// Returns the obstacles with at least `least` points, the nearest first, and the number of obstacles beyond the
+    /// maximum.
+    pub(crate) fn find(&mut self, points: &[Candidate], cube_m: f32, least: usize) -> (&[Obstacle], u32) {
+        let cube = |at: [f32; 3]| at.map(|value| (value / cube_m).floor() as i16);
+        self.cubes.clear();
+        self.cubes.extend(points.iter().zip(0..).map(|(point, number)| (cube(point.at), number)));
+        self.cubes.sort_unstable();
+        self.open.clear();
+        self.open.resize(self.cubes.len(), true);
+        self.found.clear();
+        for first in 0..self.cubes.len() {
+            if !self.open[first] || first > 0 && self.cubes[first].0 == self.cubes[first - 1].0 {
+                continue;
+            }
+            let grown = self.grown_from(first, points);
+            if grown.obstacle.points as usize >= least && !grown.is_grazed() {
+                self.found.push(grown.obstacle);
+            }
+        }
+        self.found.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
+        let left_out = self.found.len().saturating_sub(OBSTACLES) as u32;
+        self.found.truncate(OBSTACLES);
+        (&self.found, left_out)
+    }
+
+    fn grown_from(&mut self, first: usize, points: &[Candidate]) -> Grown {
+        let (inf, mut sum) = (f32::INFINITY, [0.0_f64; 3]);
+        let mut grown = Obstacle { low: [inf; 3], high: [-inf; 3], distance_m: inf, ..Obstacle::default() };
+        let (mut angles_rad, mut most_rise) = ([inf, -inf], 0.0_f32);
+        self.open[first] = false;
+        self.front.push(first);
+        while let Some(first) = self.front.pop() {
+            let cube = self.cubes[first].0;
+            for (_, number) in self.cubes[first..].iter().take_while(|(other, _)| *other == cube) {
+                let Candidate { at, flags, angle_rad, rise } = points[*number as usize];
+                angles_rad = [angles_rad[0].min(angle_rad), angles_rad[1].max(angle_rad)];
+                most_rise = most_rise.max(rise.abs());
+                for i in 0..3 {
+                    sum[i] += f64::from(at[i]);
+                    grown.low[i] = grown.low[i].min(at[i]);
+                    grown.high[i] = grown.high[i].max(at[i]);
+                }
+                grown.distance_m = grown.distance_m.min(at[0].hypot(at[1]));
+                grown.points += 1;
+                grown.flags |= flags;
+            }
+            for beside in around(cube) {
+                let place = self.cubes.partition_point(|(other, _)| *other < beside);
+                let is_there = self.cubes.get(place).is_some_and(|(other, _)| *other == beside);
+                if is_there && self.open[place] {
+                    self.open[place] = false;
+                    self.front.push(place);
+                }
+            }
+        }
+        grown.middle = sum.map(|value| (value / f64::from(grown.points)) as f32);
+        Grown { obstacle: grown, angles_rad, rise: most_rise }
+    }
+}
+
+/// Returns the 26 cubes that touch `cube`.
+fn around(cube: [i16; 3]) -> impl Iterator<Item = [i16; 3]> {
+    let offset = |i: i16| [i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1];
+    (0..27)
+        .map(offset)
+        .filter(|off| *off != [0; 3])
+        .map(move |off| std::array::from_fn(|i| cube[i].saturating_add(off[i])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn candidate((at, flags): ([f32; 3], u8)) -> Candidate {
+        Candidate { at, flags, angle_rad: 0.2, rise: -0.3 }
+    }
+
+    #[test]
+    fn a_line_that_level_beams_of_one_scan_graze_is_no_obstacle() {
+        let line = |flags, angle_rad: f32, rise| {
+            let point = move |i| ([4.0, 0.05 * i as f32, 0.7 + angle_rad], flags);
+            (0..12).map(move |i| Candidate { angle_rad, rise, ..candidate(point(i)) })
+        };
+        let mut clusters = Clusters::default();
+        let mut count = |points: Vec<Candidate>| clusters.find(&points, 0.15, 8).0.len();
+        assert_eq!(count(line(Obstacle::FOREGROUND, 0.0, -0.02).collect()), 0);
+        assert_eq!(count(line(Obstacle::FOREGROUND, 0.0, -0.2).collect()), 1, "steep beams");
+        assert_eq!(count(line(Obstacle::NEAR, 0.0, -0.02).collect()), 1, "in the box near");
+        let two = line(Obstacle::FOREGROUND, 0.0, -0.02).chain(line(Obstacle::FOREGROUND, 0.01, -0.01));
+        assert_eq!(count(two.collect()), 1, "two scans");
+    }
+
+    #[test]
+    fn near_points_are_one_obstacle_and_few_are_none() {
+        let pole = (0..20).map(|i| ([2.0, 0.0, 0.05 * i as f32], Obstacle::FOREGROUND));
+        let crate_ = (0..9).map(|i| ([1.0 + 0.1 * i as f32, -1.0, 0.3], Obstacle::NEAR));
+        let speck = (0..3).map(|i| ([5.0, 5.0, 0.1 * i as f32], Obstacle::FOREGROUND));
+        let mut clusters = Clusters::default();
+        let (found, left_out) =
+            clusters.find(&pole.chain(crate_).chain(speck).map(candidate).collect::<Vec<_>>(), 0.15, 5);
+        assert_eq!((found.len(), left_out), (2, 0));
+        assert_eq!((found[0].points, found[0].flags), (9, Obstacle::NEAR), "the nearest first");
+        assert!((found[0].distance_m - 2.0_f32.sqrt()).abs() < 1e-6);
+        let pole = found[1];
+        assert_eq!((pole.low, pole.high, pole.points), ([2.0, 0.0, 0.0], [2.0, 0.0, 0.95], 20));
+        assert!((pole.middle[2] - 0.475).abs() < 1e-6);
+    }
+
+    /// The same by the definition: pairs of points whose cubes touch have the same name, until nothing changes.
+    fn slowly(points: &[[f32; 3]], cube_m: f32, least: usize) -> Vec<usize> {
+        let cube = |at: &[f32; 3]| at.map(|value| (value / cube_m).floor() as i32);
+        let mut names: Vec<usize> = (0..points.len()).collect();
+        let mut changes = true;
+        while changes {
+            changes = false;
+            for a in 0..points.len() {
+                for b in 0..points.len() {
+                    let (x, y) = (cube(&points[a]), cube(&points[b]));
+                    if (0..3).all(|i| (x[i] - y[i]).abs() <= 1) && names[b] < names[a] {
+                        names[a] = names[b];
+                        changes = true;
+                    }
+                }
+            }
+        }
+        let sizes = (0..points.len()).map(|name| names.iter().filter(|of| **of == name).count());
+        let mut sizes: Vec<usize> = sizes.filter(|size| *size >= least).collect();
+        sizes.sort_unstable();
+        sizes
+    }
+
+    #[test]
+    fn obstacles_are_those_of_the_definition() {
+        let mut clusters = Clusters::default();
+        for seed in 0..40 {
+            let mut random = fastrand::Rng::with_seed(seed);
+            let count = random.usize(0..90);
+            let points: Vec<[f32; 3]> =
+                (0..count).map(|_| std::array::from_fn(|_| 1.6 * random.f32() - 0.8)).collect();
+            let flagged: Vec<_> = points.iter().map(|at| candidate((*at, 1))).collect();
+            let (found, left_out) = clusters.find(&flagged, 0.15, 2);
+            let mut sizes: Vec<usize> = found.iter().map(|obstacle| obstacle.points as usize).collect();
+            sizes.sort_unstable();
+            assert_eq!((sizes, left_out), (slowly(&points, 0.15, 2), 0), "seed {seed}");
+        }
+    }
 }

@@ -1,31 +1,31 @@
-//! Which leg belongs to which place, so that all together fit best. Legs and places that nobody else wants are given at once;
-//! those that compete go to a solver. Refuses to know what legs are.
+//! Assigns legs to the expected positions of legs, so that the sum of the gains is maximal. Pairs without competition are
+//! assigned at once; the others go to a solver.
 
 use pathfinding::matrix::Matrix;
 use pathfinding::prelude::kuhn_munkres;
 
-/// A leg that may belong to a place.
+/// A leg that may belong to an expected position.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Edge {
     pub(crate) leg: usize,
     pub(crate) place: usize,
-    /// More than 0: how much better this is than leaving both alone.
+    /// Gain compared with leaving both unassigned. Always more than 0.
     pub(crate) gain: f64,
 }
 
-/// The memory of an assignment.
+/// Solver with its buffers.
 #[derive(Default)]
 pub(crate) struct Assignment {
-    /// Number of the group of each leg, and of each place behind them.
+    /// Group of each leg, and then of each position.
     group: Vec<usize>,
     legs: Vec<usize>,
     places: Vec<usize>,
-    /// Group and number of each edge.
+    /// Group and index of each edge.
     order: Vec<(usize, usize)>,
 }
 
 impl Assignment {
-    /// Appends to `pairs` each leg with its place, so that the sum of the gains is the greatest.
+    /// Appends each leg with its position to `pairs`, so that the sum of the gains is maximal.
     pub(crate) fn solve(
         &mut self,
         (legs, places): (usize, usize),
@@ -43,7 +43,7 @@ impl Assignment {
             let root = self.root(edge.leg);
             self.order.push((root, i));
         }
-        // By group, in the order in which they came.
+        // By group, in the order of the edges.
         self.order.sort_unstable();
         let order = std::mem::take(&mut self.order);
         for group in order.chunk_by(|a, b| a.0 == b.0) {
@@ -67,7 +67,7 @@ impl Assignment {
     }
 
     fn compete(&self, edges: &[Edge], group: &[(usize, usize)], pairs: &mut Vec<(usize, usize)>) {
-        // The two legs of one person, mostly.
+        // Usually the two legs of one person.
         if let (&[leg, other_leg], &[place, other_place]) = (&self.legs[..], &self.places[..]) {
             let find = |leg: usize, place: usize| {
                 group.iter().map(|&(_, i)| &edges[i]).find(|one| (one.leg, one.place) == (leg, place))
@@ -79,7 +79,7 @@ impl Assignment {
             pairs.extend(best.into_iter().flatten().map(|edge| (edge.leg, edge.place)));
             return;
         }
-        // The solver wants at least as many columns as rows.
+        // The solver requires at least as many columns as rows.
         let turn = self.legs.len() > self.places.len();
         let (rows, columns) = if turn { (&self.places, &self.legs) } else { (&self.legs, &self.places) };
         let mut weights = Matrix::new(rows.len(), columns.len(), 0_i64);
@@ -99,7 +99,7 @@ impl Assignment {
         }
     }
 
-    /// Elements for which there is memory.
+    /// Returns the number of elements that memory is allocated for.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
         self.group.capacity() + self.legs.capacity() + self.places.capacity() + self.order.capacity()
@@ -118,7 +118,7 @@ impl Assignment {
 mod tests {
     use super::*;
 
-    /// The slow way: each leg with each place that is free, or with none.
+    /// The slow algorithm: each leg with each free position, or with none.
     fn best(edges: &[Edge], leg: usize, legs: usize, taken: u32) -> f64 {
         if leg == legs {
             return 0.0;

@@ -1,6 +1,6 @@
-//! Points, segments and polygons of a plan, in metres. Refuses to know what they stand for.
+//! Points, segments and polygons of a plan, in meters.
 
-/// A point in the frame of the map: x to the right, y up, in metres.
+/// A point in the frame of the map: x to the right, y up, in meters.
 pub type Point = [f64; 2];
 
 /// Returns `a - b`.

@@ -1,81 +1,73 @@
-//! Doors, and who comes out of an unseen way: which door leads from room to room, and how likely it is that somebody who
-//! went in then is the one who is seen now. Refuses to know sensors.
+//! Likelihood that a person who comes into view is one who went where no sensor looks. It follows from position, walking speed
+//! and time, and from the gaps of the site.
 
-use crate::track::geometry::{Point, distance_to_segment, length2, middle, minus};
-use crate::track::site::Site;
+use super::geometry::{Point, distance_to_segment, length2, middle, minus};
+use super::site::Site;
 
-/// Longest time of a way of which no gap tells.
+/// Maximum time of a path that is not in the site file, in seconds.
 pub(crate) const LONGEST_S: f64 = 60.0;
-/// Spread of the logarithm of how fast somebody walks, around his own pace.
+/// Spread of the logarithm of a person's speed around their pace.
 const SPREAD: f64 = 0.2;
-/// Share of those who walk on without a stop, if they walked when they were seen last, and if they stood.
+/// Share of people who walk on without a stop, if they walked when they were last seen, and if they stood.
 const WALKS: f64 = 0.6;
 const WALKS_ON: f64 = 0.3;
-/// Share of those who stay where they are, and for how many seconds they do.
+/// Share of people who stay at their position, and the time for which they do, in seconds.
 const STAYS: f64 = 0.4;
 const STAYS_S: f64 = 4.0;
-/// Share of those who turn round.
+/// Share of people who turn back.
 const TURNS: f64 = 0.04;
-/// Who is faster than this walks.
+/// Minimum speed of a person who walks.
 const WALKING_M_S: f64 = 0.5;
-/// Who goes back is at least so fast.
+/// Minimum speed of a person who goes back.
 const BACK_M_S: f64 = 0.35;
-/// How well places are known, along the way and beside it; beside it they spread by so much a second, to the width of a way.
+/// Standard deviations of positions along and across the path. Across, it grows per second, up to the width of a
+/// path.
 const ALONG_M: f64 = 0.25;
 const BESIDE_M: f64 = 0.25;
 const BESIDE_M_S: f64 = 0.3;
 const WIDTH_M: f64 = 0.7;
-/// Who would be sooner or much later than the gap says.
+/// Likelihood of a person who is earlier or much later than the gap allows.
 const HARDLY: f64 = 1e-6;
-/// Length of a way whose end is not known.
+/// Length of a path with an unknown end.
 const REST_M: f64 = 5.0;
 
-/// Somebody who is out of sight.
-pub(crate) struct Gone {
-    /// The door that he came by.
+/// A person who is out of sight.
+pub(crate) struct DepartedPerson {
+    /// Door through which they went.
     pub(crate) entry: Option<usize>,
-    /// Where he was last, and how fast.
+    /// Last position, and speed in m/s.
     pub(crate) at: Point,
     pub(crate) speed: f64,
-    /// How fast he walks when he does.
+    /// Walking speed in m/s.
     pub(crate) pace: f64,
 }
 
-/// Somebody who is new.
-pub(crate) struct New {
-    /// The door that he is the nearest to.
+/// A person who came into view.
+pub(crate) struct ArrivedPerson {
+    /// Nearest door.
     pub(crate) exit: usize,
-    /// Where he was seen first.
+    /// Position at which they were first seen.
     pub(crate) at: Point,
     pub(crate) velocity: Point,
-    /// He is behind that door, in a room with sensors.
+    /// Whether they are behind that door, in a room with sensors.
     pub(crate) is_out: bool,
 }
 
 impl Site {
-    /// Returns the door from `from` to `to` that is nearest to `place`.
-    pub(crate) fn door_between(&self, from: Option<usize>, to: Option<usize>, place: Point) -> Option<usize> {
-        let between = |door: usize| {
-            let ends = (self.doors[door].from, self.doors[door].to);
-            ends == (from, to) || ends == (to, from)
-        };
-        let off = |&door: &usize| distance_to_segment(place, self.doors[door].between);
-        (0..self.doors.len()).filter(|&door| between(door)).min_by(|a, b| off(a).total_cmp(&off(b)))
-    }
-
-    /// Returns the seconds of the gap between two doors, shortest and longest.
+    /// Returns the minimum and maximum time of the gap between two doors, in seconds.
     fn gap(&self, [a, b]: [usize; 2]) -> [f64; 2] {
         let found = self.gaps.iter().find(|gap| gap.doors == [a, b] || gap.doors == [b, a]);
         found.map_or([0.0, LONGEST_S], |gap| gap.seconds)
     }
 
-    /// Returns how likely it is, per square metre, that `gone`, who went out of sight `after_s` seconds ago, is where `new` is
-    /// seen, given that he is still on his way: he walks on at his pace, walks on after a stop, stays, or turns round.
-    pub(crate) fn likelihood(&self, gone: &Gone, new: &New, after_s: f64) -> f64 {
+    /// Returns the likelihood per square meter that `gone`, who went out of sight `after_s` seconds ago, is at the position of
+    /// `new`. The person is assumed to be still on the path: they walk on at their pace, walk on after a stop, stay, or turn
+    /// back.
+    pub(crate) fn likelihood(&self, gone: &DepartedPerson, new: &ArrivedPerson, after_s: f64) -> f64 {
         let t = after_s.max(0.0);
         let off = minus(new.at, gone.at);
         let far_m = length2(off).sqrt();
-        // How far ahead he would be, how long the rest of the way was, and how fast he goes ahead.
+        // The distance that they would be ahead, the length of the rest of the path, and the speed ahead.
         let (ahead_m, rest_m, speed) = match gone.entry {
             Some(entry) => {
                 let door = self.doors[entry].between;
@@ -141,8 +133,7 @@ fn normal_below(z: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Gone, New, normal_below};
-    use crate::track::Site;
+    use super::{ArrivedPerson, DepartedPerson, Site, normal_below};
 
     const HOUSE: &str = r#"
 [[sensor]]
@@ -178,9 +169,11 @@ seconds = [2, 15]
     #[test]
     fn who_comes_from_the_other_side_comes_out_and_who_stood_there_still_does() {
         let site = Site::parse("house.toml", HOUSE).expect("a house");
-        let gone = |entry: usize, x: f64| Gone { entry: Some(entry), at: [x, 2.5], speed: 1.0, pace: 1.1 };
+        let gone =
+            |entry: usize, x: f64| DepartedPerson { entry: Some(entry), at: [x, 2.5], speed: 1.0, pace: 1.1 };
         let (from_left, from_right) = (gone(0, 6.5), gone(1, 10.5));
-        let new = |x: f64, vx: f64| New { exit: 0, at: [x, 2.5], velocity: [vx, 0.0], is_out: x < 6.0 };
+        let new =
+            |x: f64, vx: f64| ArrivedPerson { exit: 0, at: [x, 2.5], velocity: [vx, 0.0], is_out: x < 6.0 };
         for comes in [new(6.7, -1.0), new(5.7, -1.0)] {
             let (turns, walks) =
                 (site.likelihood(&from_left, &comes, 4.0), site.likelihood(&from_right, &comes, 4.0));

@@ -1,67 +1,72 @@
-//! One person as the tracker follows him: filter, and what speaks for him and against him. Refuses to know other persons.
+//! One person as the tracker follows them: the evidence for and against the person, and a linear Kalman filter of position and
+//! velocity.
+//!
+//! The state of the filter is the middle between the legs with its velocity, and half of the vector from one leg to the
+//! other, which swings. A leg is at the middle plus or minus this half. Both coordinates have the same covariance.
 
+use nalgebra::{Matrix4, Matrix4x2, RowVector2, Vector4};
 use scanhub_schema::TrackState;
 
-use crate::track::filter::{Filter, Side};
-use crate::track::geometry::Point;
-use crate::track::sight::Leg;
+use super::geometry::{Point, distance};
+use super::sensor_view::Leg;
+use super::site::SENSORS;
 
 /// One person.
 pub(crate) struct Person {
     pub(crate) id: u64,
     pub(crate) filter: Filter,
-    /// What the filter holds for, in ns.
+    /// Time of the filter's state in ns.
     pub(crate) at_ns: u64,
     pub(crate) born_ns: u64,
-    /// Where he was first seen.
+    /// Position at which they were first seen.
     pub(crate) born_at: Point,
-    pub(crate) life: Life,
-    /// When a leg of his was seen last.
+    pub(crate) life: TrackPhase,
+    /// Time at which a leg of theirs was last seen.
     pub(crate) seen_ns: u64,
     /// Time at which a leg of theirs was last seen outside the ignored areas.
     pub(crate) free_ns: u64,
-    /// When each sensor saw him last; 0 never.
-    pub(crate) seen_by_ns: [u64; crate::track::site::SENSORS],
-    /// Scans that spoke for him, at most [`MOST_SUPPORT`]; one of a slow sensor counts up to twice.
+    /// Time at which each sensor last saw them. 0 before the first time.
+    pub(crate) seen_by_ns: [u64; SENSORS],
+    /// Number of scans that are evidence for them, at most [`MOST_SUPPORT`]. One of a slow sensor counts up to twice.
     pub(crate) support: f64,
-    /// Scans that showed both legs.
+    /// Number of scans that showed both legs.
     pub(crate) pairs: f64,
-    /// For how many seconds he was seen through.
+    /// Seconds for which sensors have seen through their position.
     pub(crate) absent_s: f64,
-    /// How fast he walks when he does.
+    /// Walking speed in m/s.
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
-    /// The door by which he came into that room, if he was seen to.
+    /// Door through which they were seen to enter that room.
     pub(crate) came_by: Option<usize>,
-    /// Share of the scans that see him and show both legs, of late.
+    /// Share of the recent scans of them that show both legs.
     pub(crate) both: f64,
 }
 
-/// Where a person is in his life.
+/// Phase of a track.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Life {
+pub(crate) enum TrackPhase {
     Tentative,
     Known,
-    /// Out of sight since then, having gone through that door.
+    /// Out of sight since this time, after going through this door.
     Away {
         since_ns: u64,
         door: usize,
     },
 }
 
-/// So many scans make somebody known.
+/// Minimum number of scans that confirm a person.
 const ENOUGH: f64 = 8.0;
 pub(crate) const MOST_SUPPORT: f64 = 20.0;
-/// Longest time between two scans of a sensor of which each counts as one. Those of a slower one count up to twice: else
-/// somebody would not be known for a second at 7.5 Hz.
+/// Maximum period of a sensor whose scans count once. Scans of a slower sensor count up to twice; otherwise it would
+/// take a second to confirm a person at 7.5 Hz.
 const FULL_S: f64 = 0.0625;
-/// Beams on a leg that is certainly not the leg of a chair.
+/// Minimum number of beams on a leg that is certainly not the leg of a chair.
 const CLEAR_BEAMS: usize = 4;
-/// Weight of a leg of fewer beams, compared with a sensor that sees through the place.
+/// Weight of a leg with fewer beams, compared with a sensor that sees through the position.
 pub(crate) const COARSE: f64 = 0.5;
-/// Nobody is known sooner.
+/// Minimum age of a confirmed person.
 const SOONEST_NS: u64 = 300_000_000;
-/// Who was seen within this time is not hidden.
+/// A person who was seen within this time is not hidden.
 const LATELY_NS: u64 = 250_000_000;
 
 impl Person {
@@ -76,10 +81,10 @@ impl Person {
             filter,
             at_ns,
             born_ns: at_ns,
-            life: Life::Tentative,
+            life: TrackPhase::Tentative,
             seen_ns: at_ns,
             free_ns: at_ns,
-            seen_by_ns: [0; crate::track::site::SENSORS],
+            seen_by_ns: [0; SENSORS],
             support: 1.0,
             pairs: if legs.len() > 1 { 1.0 } else { 0.0 },
             absent_s: 0.0,
@@ -113,7 +118,7 @@ impl Person {
         self.support = (self.support + (since_s / FULL_S).clamp(1.0, 2.0)).min(MOST_SUPPORT);
         let speed = self.speed();
         if speed > 0.5 {
-            // Who turns or gives way is slower than his pace.
+            // A person who turns or gives way is slower than their pace.
             self.pace += if speed > self.pace { 0.03 } else { 0.01 } * (speed - self.pace);
         }
     }
@@ -123,26 +128,26 @@ impl Person {
         (x * x + y * y).sqrt()
     }
 
-    /// He is a person: he is seen often enough, and has two legs, or moves as no thing does.
+    /// Returns whether this is certainly a person: seen often enough, with two legs, or in motion.
     pub(crate) fn is_sure(&self) -> bool {
-        let way = crate::track::geometry::distance(self.filter.place(), self.born_at);
+        let way = distance(self.filter.place(), self.born_at);
         self.support >= ENOUGH && self.at_ns - self.born_ns >= SOONEST_NS && (self.pairs >= 3.0 || way > 0.3)
     }
 
     pub(crate) fn is_known(&self) -> bool {
-        self.life == Life::Known
+        self.life == TrackPhase::Known
     }
 
     pub(crate) fn state(&self, now_ns: u64) -> TrackState {
         match self.life {
-            Life::Tentative => TrackState::Tentative,
-            Life::Away { .. } => TrackState::BetweenRooms,
-            Life::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => TrackState::Hidden,
-            Life::Known => TrackState::Confirmed,
+            TrackPhase::Tentative => TrackState::Tentative,
+            TrackPhase::Away { .. } => TrackState::BetweenRooms,
+            TrackPhase::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => TrackState::Hidden,
+            TrackPhase::Known => TrackState::Confirmed,
         }
     }
 
-    /// Sensors that saw him within a quarter of a second, as bits.
+    /// Returns the sensors that have seen them within the last 250 ms, as bits.
     pub(crate) fn sensors(&self, now_ns: u64) -> u32 {
         let lately = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= LATELY_NS;
         (0..)
@@ -153,10 +158,139 @@ impl Person {
     }
 }
 
+/// Spectral density of the body's acceleration, m2/s3.
+const BODY_NOISE: f64 = 0.6;
+/// Angular frequency of the swing of legs in rad/s: 0.8 double steps a second.
+const SWING: f64 = 5.0;
+/// Damping of the swing as a share of the critical damping.
+const DAMPING: f64 = 0.5;
+/// Spectral density of a leg's acceleration in m2/s3. With the two constants above, a leg is 0.14 m away from the
+/// middle.
+const LEG_NOISE: f64 = 5.0;
+/// Maximum length of a prediction step in seconds, and maximum number of steps.
+const LONGEST_STEP_S: f64 = 0.05;
+const MOST_STEPS: f64 = 40.0;
+/// Standard deviations for a new person: velocity in m/s, and half of the distance between the legs.
+const NEW_SPEED: f64 = 0.9;
+const NEW_HALF_M: f64 = 0.17;
+
+/// One of the two legs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Side {
+    Plus,
+    Minus,
+}
+
+/// The filter of one person.
+#[derive(Clone, Debug)]
+pub(crate) struct Filter {
+    /// Rows: middle, velocity, half vector between the legs, its velocity. Columns: x and y.
+    state: Matrix4x2<f64>,
+    covariance: Matrix4<f64>,
+}
+
+impl Side {
+    pub(crate) const BOTH: [Side; 2] = [Side::Plus, Side::Minus];
+
+    fn row(self) -> Vector4<f64> {
+        let sign = if self == Side::Plus { 1.0 } else { -1.0 };
+        Vector4::new(1.0, 0.0, sign, 0.0)
+    }
+}
+
+impl Filter {
+    /// Creates the filter of a person whose one leg is seen.
+    pub(crate) fn of_leg(at: Point, sigma_m: f64) -> Filter {
+        let mut covariance = Matrix4::zeros();
+        let half = NEW_HALF_M * NEW_HALF_M;
+        covariance[(0, 0)] = half + sigma_m * sigma_m;
+        covariance[(0, 2)] = -half;
+        covariance[(2, 0)] = -half;
+        covariance[(2, 2)] = half;
+        covariance[(1, 1)] = NEW_SPEED * NEW_SPEED;
+        covariance[(3, 3)] = half * SWING * SWING;
+        let mut state = Matrix4x2::zeros();
+        state.set_row(0, &RowVector2::new(at[0], at[1]));
+        Filter { state, covariance }
+    }
+
+    /// Predicts the state `dt` seconds later, in steps that are short compared with a swing. If `fades`, the person
+    /// is not seen, and the velocity decays.
+    pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
+        let steps = (dt / LONGEST_STEP_S).ceil().clamp(1.0, MOST_STEPS);
+        (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
+    }
+
+    fn step(&mut self, dt: f64, fades: bool) {
+        let keep = if fades { (-dt / 1.5).exp() } else { 1.0 };
+        #[rustfmt::skip]
+        let swing = Matrix4::new(
+            1.0, dt, 0.0, 0.0,
+            0.0, keep, 0.0, 0.0,
+            0.0, 0.0, 1.0, dt,
+            0.0, 0.0, -SWING * SWING * dt, (1.0 - 2.0 * DAMPING * SWING * dt).max(0.0),
+        );
+        self.state = swing * self.state;
+        self.covariance = swing * self.covariance * swing.transpose();
+        for (row, noise) in [(0, BODY_NOISE), (2, LEG_NOISE)] {
+            self.covariance[(row, row)] += noise * dt * dt * dt / 3.0;
+            self.covariance[(row, row + 1)] += noise * dt * dt / 2.0;
+            self.covariance[(row + 1, row)] += noise * dt * dt / 2.0;
+            self.covariance[(row + 1, row + 1)] += noise * dt;
+        }
+    }
+
+    /// Returns the expected position of a leg, and the variance of each coordinate.
+    pub(crate) fn leg(&self, side: Side) -> (Point, f64) {
+        let row = side.row();
+        let at = row.transpose() * self.state;
+        ([at[0], at[1]], (row.transpose() * self.covariance * row)[0])
+    }
+
+    /// Corrects the state by a measured leg.
+    pub(crate) fn correct(&mut self, side: Side, at: Point, sigma_m: f64) {
+        let row = side.row();
+        let reach = self.covariance * row;
+        let variance = row.dot(&reach) + sigma_m * sigma_m;
+        let gain = reach / variance;
+        let off = RowVector2::new(at[0], at[1]) - row.transpose() * self.state;
+        self.state += gain * off;
+        self.covariance -= gain * reach.transpose();
+    }
+
+    /// Returns the middle between the legs.
+    pub(crate) fn place(&self) -> Point {
+        [self.state[(0, 0)], self.state[(0, 1)]]
+    }
+
+    /// Returns the velocity in m/s.
+    pub(crate) fn velocity(&self) -> Point {
+        [self.state[(1, 0)], self.state[(1, 1)]]
+    }
+
+    #[cfg(test)]
+    fn half(&self) -> Point {
+        [self.state[(2, 0)], self.state[(2, 1)]]
+    }
+
+    /// Returns the variance of each coordinate of the position.
+    pub(crate) fn variance(&self) -> f64 {
+        self.covariance[(0, 0)]
+    }
+
+    /// Stops the person at `place`, in front of a wall.
+    pub(crate) fn stop(&mut self, place: Point) {
+        self.state.set_row(0, &RowVector2::new(place[0], place[1]));
+        self.state.set_row(1, &RowVector2::zeros());
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use nalgebra::DMatrix;
+
     use super::*;
-    use crate::track::sight::AtDoor;
+    use crate::track::sensor_view::AtDoor;
 
     #[test]
     fn somebody_is_known_after_eight_scans_or_fewer_of_a_slow_sensor() {
@@ -187,5 +321,56 @@ mod tests {
         assert_eq!(known_after_ms(100), 500);
         assert_eq!(known_after_ms(133), 532);
         assert_eq!(known_after_ms(200), 800);
+    }
+
+    #[test]
+    fn agrees_with_the_textbook_form_by_whole_matrices() {
+        // The slow algorithm: eight states, with both coordinates and both legs measured at once.
+        let mut random = fastrand::Rng::with_seed(2);
+        let mut filter = Filter::of_leg([1.0, 2.0], 0.03);
+        for _ in 0..200 {
+            let dt = 0.005 + 0.05 * random.f64();
+            let before = filter.clone();
+            filter.predict(dt, false);
+            let legs = [0, 1].map(|_| [1.0 + random.f64(), 2.0 + random.f64()]);
+            let wide = |m: &Matrix4<f64>| {
+                DMatrix::from_fn(8, 8, |i, j| if i / 4 == j / 4 { m[(i % 4, j % 4)] } else { 0.0 })
+            };
+            let predicted = filter.clone();
+            let p = wide(&predicted.covariance);
+            let h = DMatrix::from_fn(4, 8, |i, j| {
+                let side = if i % 2 == 0 { Side::Plus } else { Side::Minus };
+                if i / 2 == j / 4 { side.row()[j % 4] } else { 0.0 }
+            });
+            let s = &h * &p * h.transpose() + DMatrix::identity(4, 4) * 0.03 * 0.03;
+            let gain = &p * h.transpose() * s.try_inverse().unwrap();
+            let x = DMatrix::from_fn(8, 1, |i, _| predicted.state[(i % 4, i / 4)]);
+            let z = DMatrix::from_fn(4, 1, |i, _| legs[i % 2][i / 2]);
+            let x = &x + &gain * (z - &h * &x);
+            let p = (DMatrix::identity(8, 8) - &gain * &h) * p;
+            filter.correct(Side::Plus, legs[0], 0.03);
+            filter.correct(Side::Minus, legs[1], 0.03);
+            for i in 0..8 {
+                assert!((x[(i, 0)] - filter.state[(i % 4, i / 4)]).abs() < 1e-6, "after {before:?}");
+            }
+            assert!((&p - wide(&filter.covariance)).amax() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn who_is_not_seen_slows_down_and_gets_uncertain() {
+        let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
+        for i in 0..50 {
+            filter.predict(0.04, false);
+            let x = 0.04 * f64::from(i);
+            filter.correct(Side::Plus, [x, 0.1], 0.03);
+            filter.correct(Side::Minus, [x, -0.1], 0.03);
+        }
+        assert!((filter.velocity()[0] - 1.0).abs() < 0.1 && filter.variance() < 0.03 * 0.03);
+        let from = filter.place()[0];
+        (0..250).for_each(|_| filter.predict(0.04, true));
+        let walked = filter.place()[0] - from;
+        assert!((1.2..1.8).contains(&walked) && filter.variance() > 0.5, "{walked} {}", filter.variance());
+        assert!((filter.half()[0].powi(2) + filter.half()[1].powi(2)).sqrt() < 0.05);
     }
 }

@@ -1,17 +1,22 @@
-//! A site: where sensors, rooms and doors are, in one map. Refuses to know who walks there.
+//! A site: sensors, rooms and doors in one map, as a site file describes them. Reading a site file checks that it makes a
+//! plan: names are unique, rooms do not overlap, doors are in the walls of their rooms, and every room can be reached.
 
-mod check;
-mod drawing;
-mod file;
+use std::fmt::Display;
+use std::ops::Range;
 
-use crate::track::geometry::{
-    Point, contains, distance, distance_to_border, distance_to_segment, dot, middle, minus,
+use scanhub_schema::{Failure, Kind, check_followed};
+use serde::Deserialize;
+use toml::Spanned;
+
+use super::geometry::{
+    Point, area, contains, crosses_itself, distance, distance_to_border, distance_to_segment, dot, middle,
+    minus, overlap,
 };
-use crate::track::sight::AtDoor;
+use super::sensor_view::AtDoor;
 
-/// The most sensors of a site: as many as a hub has links.
+/// Maximum number of sensors of a site, which is the maximum number of links of a hub.
 pub const SENSORS: usize = 32;
-/// The most rooms.
+/// Maximum number of rooms.
 pub const ROOMS: usize = 64;
 /// Maximum number of ignored areas.
 pub const IGNORED: usize = 64;
@@ -19,69 +24,60 @@ pub const IGNORED: usize = 64;
 /// A plan that was checked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Site {
-    /// In the order of the file.
+    /// Sensors in the order of the file.
     pub sensors: Vec<Sensor>,
-    /// Their polygons do not overlap.
-    pub rooms: Vec<Room>,
-    /// From room to room, or to outside.
+    /// Rooms, whose polygons do not overlap.
+    pub rooms: Vec<Area>,
+    /// Doors from room to room, or to outside.
     pub doors: Vec<Door>,
-    /// Ways between doors that no sensor sees.
+    /// Paths between doors that no sensor covers.
     pub gaps: Vec<Gap>,
     /// Areas in which legs start no track. They may overlap rooms, doors and each other.
-    pub ignored: Vec<Ignored>,
+    pub ignored: Vec<Area>,
 }
 
-/// A sensor, and where it is in the map.
+/// A sensor with its pose in the map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sensor {
-    /// As consumers know it: `front`, or `kitchen.front` of another machine.
+    /// Name as in topics: `front`, or `kitchen.front` for a remote sensor.
     pub name: String,
-    /// Metres in the map.
+    /// Position in the map in meters.
     pub place: Point,
-    /// Where it looks, in radians counter-clockwise from x.
+    /// Direction in radians, counterclockwise from x.
     pub yaw_rad: f64,
-    /// Its beams run the other way.
+    /// Whether it is mounted upside down, so that its beams run clockwise.
     pub is_upside_down: bool,
 }
 
-/// A room.
+/// A room, or an area with something that moves and is not a person, such as a fountain, a revolving door or a curtain.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Room {
-    /// As in events.
+pub struct Area {
+    /// Name as in events and in the drawing.
     pub name: String,
-    /// Its corners in metres, at least three.
+    /// Corners in meters, at least three.
     pub polygon: Vec<Point>,
 }
 
 /// An opening between two rooms, or a room and outside.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Door {
-    /// As in events.
+    /// Name as in events.
     pub name: String,
-    /// The room on the one side; none: outside.
+    /// Index of the room on one side. `None` is outside.
     pub from: Option<usize>,
-    /// The room on the other side; none: outside.
+    /// Index of the room on the other side. `None` is outside.
     pub to: Option<usize>,
-    /// Its two jambs.
+    /// Both sides of the door frame.
     pub between: [Point; 2],
 }
 
-/// Doors that a way connects which no sensor sees, and how long it takes.
+/// A path between two doors that no sensor covers, and the time that it takes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
-    /// Numbers of the two doors.
+    /// Indices of the two doors.
     pub doors: [usize; 2],
-    /// Shortest and longest time, in seconds.
+    /// Minimum and maximum time in seconds.
     pub seconds: [f64; 2],
-}
-
-/// An area with something that moves and is not a person, such as a fountain, a revolving door or a curtain.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Ignored {
-    /// Name in the drawing.
-    pub name: String,
-    /// Corners in meters, at least three.
-    pub polygon: Vec<Point>,
 }
 
 impl Site {
@@ -116,7 +112,7 @@ impl Site {
                 return if (JAMB_M..width - JAMB_M).contains(&share) { AtDoor::Line } else { AtDoor::Jamb };
             }
             if distance(point, *a).min(distance(point, *b)) < leaf_m + LINE_M {
-                found = AtDoor::Swing;
+                found = AtDoor::ReversalDetector;
             }
         }
         found
@@ -127,10 +123,16 @@ impl Site {
         self.rooms.iter().position(|room| contains(&room.polygon, point))
     }
 
+    /// Returns the door nearest to `point` of those that `is_candidate` selects.
+    pub(crate) fn nearest_door(&self, point: Point, is_candidate: impl Fn(&usize) -> bool) -> Option<usize> {
+        let off = |&door: &usize| distance_to_segment(point, self.doors[door].between);
+        (0..self.doors.len()).filter(is_candidate).min_by(|a, b| off(a).total_cmp(&off(b)))
+    }
+
     /// Returns the rooms in which there is a sensor, in the order of the rooms. A sensor on a wall is in every room that it
     /// touches, at most 0.15 m away.
     pub fn watched(&self) -> Vec<bool> {
-        let watched = |room: &Room| {
+        let watched = |room: &Area| {
             let mut places = self.sensors.iter().map(|sensor| sensor.place);
             places.any(|place| touches(&room.polygon, place, ON_THE_WALL_M))
         };
@@ -143,8 +145,16 @@ impl Site {
     }
 }
 
+impl Door {
+    /// Returns the rooms on both sides.
+    pub(crate) fn rooms(&self) -> [Option<usize>; 2] {
+        [self.from, self.to]
+    }
+}
+
 impl Sensor {
-    /// Returns the machine that its samples are stamped by: of `kitchen.front` it is `kitchen`, of a local one `""`.
+    /// Returns the name of the hub whose clock stamps its samples: `kitchen` for `kitchen.front`, `""` for a local
+    /// sensor.
     pub fn hub(&self) -> &str {
         self.name.split_once('.').map_or("", |(hub, _)| hub)
     }
@@ -156,9 +166,9 @@ impl Sensor {
     }
 }
 
-/// The most bytes of a name of a room or door: so many have place in an event.
+/// Maximum length of the name of a room or door in bytes, as in an event.
 pub const NAME: usize = 24;
-/// What a door leads to where there is no room.
+/// Name of the other side of a door to the street.
 pub const OUTSIDE: &str = "outside";
 /// Maximum width of a leaf of a door, in meters.
 const WIDEST_LEAF_M: f64 = 1.3;
@@ -166,9 +176,386 @@ const WIDEST_LEAF_M: f64 = 1.3;
 const JAMB_M: f64 = 0.15;
 /// Maximum distance of a leaf that slides from the line between the jambs.
 const LINE_M: f64 = 0.15;
-/// A sensor so near a wall sits on it.
+/// Maximum distance from a wall of a sensor on it.
 const ON_THE_WALL_M: f64 = 0.15;
 
 fn touches(polygon: &[Point], point: Point, tolerance_m: f64) -> bool {
     contains(polygon, point) || distance_to_border(polygon, point) <= tolerance_m
+}
+
+/// Text of a file, and its name in errors.
+struct Source<'a> {
+    name: &'a str,
+    text: &'a str,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    #[serde(default)]
+    sensor: Vec<SensorEntry>,
+    #[serde(default)]
+    room: Vec<AreaEntry>,
+    #[serde(default)]
+    door: Vec<DoorEntry>,
+    #[serde(default)]
+    gap: Vec<GapEntry>,
+    #[serde(default)]
+    ignore: Vec<AreaEntry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SensorEntry {
+    name: Spanned<String>,
+    pose: Spanned<PoseEntry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PoseEntry {
+    x: f64,
+    y: f64,
+    yaw: f64,
+    #[serde(default)]
+    upside_down: bool,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct AreaEntry {
+    name: Spanned<String>,
+    polygon: Spanned<Vec<Point>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct DoorEntry {
+    name: Spanned<String>,
+    from: Spanned<String>,
+    to: Spanned<String>,
+    between: Spanned<[Point; 2]>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct GapEntry {
+    between: Spanned<[Spanned<String>; 2]>,
+    seconds: Spanned<[f64; 2]>,
+}
+
+impl Site {
+    /// Returns the site that `text` describes; errors call it `name`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] with line, column, value and remedy.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// let text = r#"
+    ///     [[sensor]]
+    ///     name = "front"
+    ///     pose = { x = 0.0, y = 2.0, yaw = 0.0 }
+    ///     [[room]]
+    ///     name = "hall"
+    ///     polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
+    /// "#;
+    /// let site = scanhub_perception::track::Site::parse("hall.toml", text)?;
+    /// assert_eq!(site.room_at([1.0, 1.0]), Some(0));
+    /// # Ok::<(), scanhub_schema::Failure>(())
+    /// ```
+    pub fn parse(name: &str, text: &str) -> Result<Site, Failure> {
+        let source = Source { name, text };
+        let file: File = toml::from_str(text).map_err(|error| source.explain(&error))?;
+        plan(&source, &file)
+    }
+}
+
+impl Source<'_> {
+    /// Returns the error for an invalid value at `span`.
+    fn refuse(&self, span: Option<Range<usize>>, what: impl Display, remedy: impl Into<String>) -> Failure {
+        let place = match span {
+            Some(span) => {
+                let before = &self.text[..span.start.min(self.text.len())];
+                let line = before.matches('\n').count() + 1;
+                let column = before.rsplit('\n').next().unwrap_or_default().chars().count() + 1;
+                format!("{}:{line}:{column}", self.name)
+            }
+            None => self.name.to_owned(),
+        };
+        Failure::new(Kind::Configuration, format!("{place}: {what}"), remedy)
+    }
+
+    fn explain(&self, error: &toml::de::Error) -> Failure {
+        let message = error.message();
+        let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+        if let (true, [unknown, known @ ..]) = (message.starts_with("unknown field"), &names[..]) {
+            let remedy = format!("{}Known here: {}", nearest(unknown, known), known.join(", "));
+            return self.refuse(error.span(), format!("unknown key `{unknown}`"), remedy);
+        }
+        self.refuse(error.span(), message, "see docs/tracks.md")
+    }
+}
+
+/// Returns a question whether the nearest of `known` was meant.
+fn nearest(word: &str, known: &[&str]) -> String {
+    let near = |a: &str| strsim::jaro_winkler(a, word);
+    let best = known.iter().max_by(|a, b| near(a).total_cmp(&near(b)));
+    best.map_or(String::new(), |best| format!("did you mean `{best}`? "))
+}
+
+/// Maximum overlap of rooms, because they are measured by hand.
+const OVERLAP_M: f64 = 0.05;
+/// Maximum distance of the middle of a door from the walls of its rooms, because walls are thick.
+const DOOR_OFF_M: f64 = 0.5;
+/// Minimum size of a room and of an ignored area in square meters, with the digits that errors show. A curtain is thin.
+const LEAST_ROOM_M2: (f64, usize) = (0.25, 2);
+const LEAST_IGNORED_M2: (f64, usize) = (0.02, 3);
+/// Maximum coordinate. Larger ones are probably in millimeters.
+const FARTHEST_M: f64 = 1_000.0;
+
+fn plan(source: &Source<'_>, file: &File) -> Result<Site, Failure> {
+    if file.sensor.is_empty() {
+        return Err(source.refuse(None, "no sensor", "add [[sensor]] with name and pose"));
+    }
+    if file.room.is_empty() {
+        return Err(source.refuse(None, "no room", "add [[room]] with name and polygon"));
+    }
+    if file.sensor.len() > SENSORS || file.room.len() > ROOMS {
+        let what = format!("{} sensors and {} rooms", file.sensor.len(), file.room.len());
+        return Err(source.refuse(None, what, format!("at most {SENSORS} sensors and {ROOMS} rooms")));
+    }
+    if let Some(entry) = file.ignore.get(IGNORED) {
+        let what = format!("{} ignored areas", file.ignore.len());
+        return Err(source.refuse(Some(entry.name.span()), what, format!("at most {IGNORED}")));
+    }
+    once(source, "sensor", file.sensor.iter().map(|entry| &entry.name))?;
+    once(source, "room", file.room.iter().map(|entry| &entry.name))?;
+    once(source, "door", file.door.iter().map(|entry| &entry.name))?;
+    once(source, "ignored area", file.ignore.iter().map(|entry| &entry.name))?;
+    let mut site = Site {
+        sensors: file.sensor.iter().map(|entry| sensor(source, entry)).collect::<Result<_, _>>()?,
+        rooms: file
+            .room
+            .iter()
+            .map(|entry| checked_area(source, "room", entry, LEAST_ROOM_M2))
+            .collect::<Result<_, _>>()?,
+        doors: Vec::new(),
+        gaps: Vec::new(),
+        ignored: Vec::new(),
+    };
+    no_overlap(source, file, &site)?;
+    site.doors = file.door.iter().map(|entry| door(source, entry, &site)).collect::<Result<_, _>>()?;
+    site.gaps = file.gap.iter().map(|entry| gap(source, entry, &site)).collect::<Result<_, _>>()?;
+    site.ignored = file.ignore.iter().map(|entry| ignored(source, entry, &site)).collect::<Result<_, _>>()?;
+    all_reachable(source, file, &site)?;
+    Ok(site)
+}
+
+fn once<'a>(
+    source: &Source<'_>,
+    what: &str,
+    names: impl Iterator<Item = &'a Spanned<String>>,
+) -> Result<(), Failure> {
+    let mut known: Vec<&str> = Vec::new();
+    for name in names {
+        let span = Some(name.span());
+        let name = name.as_ref().as_str();
+        if known.contains(&name) {
+            return Err(source.refuse(span, format!("{what} {name:?} twice"), "give each another name"));
+        }
+        if what != "sensor" && (name.is_empty() || name.len() > NAME || name == OUTSIDE) {
+            let remedy = format!("1 to {} bytes, and not {OUTSIDE:?}", NAME);
+            return Err(source.refuse(span, format!("{what} name {name:?} is not possible"), remedy));
+        }
+        known.push(name);
+    }
+    Ok(())
+}
+
+fn finite(source: &Source<'_>, span: Range<usize>, points: &[Point]) -> Result<(), Failure> {
+    let far = points.iter().flatten().find(|value| value.is_nan() || value.abs() > FARTHEST_M);
+    far.map_or(Ok(()), |value| {
+        let what = format!("{value} m is too far");
+        Err(source.refuse(Some(span), what, format!("metres, at most {FARTHEST_M}")))
+    })
+}
+
+fn sensor(source: &Source<'_>, entry: &SensorEntry) -> Result<Sensor, Failure> {
+    let name = entry.name.as_ref();
+    check_followed(name)
+        .map_err(|failure| source.refuse(Some(entry.name.span()), failure.message, failure.hint))?;
+    let (pose, span) = (entry.pose.as_ref(), entry.pose.span());
+    finite(source, span.clone(), &[[pose.x, pose.y]])?;
+    if pose.yaw.is_nan() || pose.yaw.abs() > std::f64::consts::TAU {
+        let what = format!("yaw {} of sensor {name}", pose.yaw);
+        return Err(source.refuse(Some(span), what, "radians, at most one turn: 1.5708 looks along y"));
+    }
+    Ok(Sensor {
+        name: name.clone(),
+        place: [pose.x, pose.y],
+        yaw_rad: pose.yaw,
+        is_upside_down: pose.upside_down,
+    })
+}
+
+/// Checks the area `what`: three corners or more, sides that do not cross, and a minimum size.
+fn checked_area(
+    source: &Source<'_>,
+    what: &str,
+    entry: &AreaEntry,
+    (least_m2, digits): (f64, usize),
+) -> Result<Area, Failure> {
+    let (name, span, polygon) = (entry.name.as_ref(), entry.polygon.span(), entry.polygon.as_ref());
+    finite(source, span.clone(), polygon)?;
+    let size = area(polygon).abs();
+    let (problem, remedy) = if polygon.len() < 3 {
+        (format!(": {} corners", polygon.len()), "at least three".to_owned())
+    } else if crosses_itself(polygon) {
+        (": its sides cross".to_owned(), "give the corners in their order around it".to_owned())
+    } else if size < least_m2 {
+        (format!(": {size:.digits$} m2"), format!("meters, at least {least_m2} m2"))
+    } else {
+        return Ok(Area { name: name.clone(), polygon: polygon.clone() });
+    };
+    Err(source.refuse(Some(span), format!("{what} {name}{problem}"), remedy))
+}
+
+fn ignored(source: &Source<'_>, entry: &AreaEntry, site: &Site) -> Result<Area, Failure> {
+    let ignored = checked_area(source, "ignored area", entry, LEAST_IGNORED_M2)?;
+    let (name, polygon) = (&ignored.name, &ignored.polygon);
+    if !site.rooms.iter().any(|room| overlap(&room.polygon, polygon, 0.0)) {
+        let what = format!("ignored area {name} is in no room");
+        let remedy = "correct its corners; `scanhub site check FILE --svg OUT` draws the rooms";
+        return Err(source.refuse(Some(entry.polygon.span()), what, remedy));
+    }
+    if let Some(room) = site.rooms.iter().find(|room| room.polygon.iter().all(|&at| contains(polygon, at))) {
+        let what = format!("ignored area {name} covers room {}", room.name);
+        let remedy = "make it smaller, or leave the room out";
+        return Err(source.refuse(Some(entry.polygon.span()), what, remedy));
+    }
+    Ok(ignored)
+}
+
+fn no_overlap(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failure> {
+    for (i, room) in site.rooms.iter().enumerate() {
+        if let Some(other) =
+            site.rooms[..i].iter().find(|other| overlap(&room.polygon, &other.polygon, OVERLAP_M))
+        {
+            let what = format!("rooms {} and {} overlap", other.name, room.name);
+            let remedy =
+                "move a corner: rooms may only touch; `scanhub site check FILE --svg OUT` draws them";
+            return Err(source.refuse(Some(file.room[i].polygon.span()), what, remedy));
+        }
+    }
+    Ok(())
+}
+
+fn door(source: &Source<'_>, entry: &DoorEntry, site: &Site) -> Result<Door, Failure> {
+    let name = entry.name.as_ref();
+    let side = |said: &Spanned<String>| {
+        let room = said.as_ref().as_str();
+        if room == OUTSIDE {
+            return Ok(None);
+        }
+        let found = site.rooms.iter().position(|known| known.name == room);
+        found.map(Some).ok_or_else(|| {
+            let mut known: Vec<&str> = site.rooms.iter().map(|room| room.name.as_str()).collect();
+            known.push(OUTSIDE);
+            let remedy = format!("{}Rooms here: {}", nearest(room, &known), known.join(", "));
+            source.refuse(Some(said.span()), format!("door {name}: no room {room:?}"), remedy)
+        })
+    };
+    let (from, to) = (side(&entry.from)?, side(&entry.to)?);
+    if from == to {
+        let what = format!("door {name}: both sides are {:?}", entry.to.as_ref());
+        return Err(source.refuse(Some(entry.to.span()), what, "a door leads from one room to another"));
+    }
+    let (between, span) = (*entry.between.as_ref(), entry.between.span());
+    finite(source, span.clone(), &between)?;
+    let width = distance(between[0], between[1]);
+    if !(0.3..=20.0).contains(&width) {
+        let what = format!("door {name}: {width:.2} m wide");
+        return Err(source.refuse(Some(span), what, "two jambs, 0.3 to 20 m apart"));
+    }
+    for room in [from, to].into_iter().flatten().map(|room| &site.rooms[room]) {
+        let off = distance_to_border(&room.polygon, middle(between));
+        if off > DOOR_OFF_M {
+            let what = format!("door {name}: {off:.2} m from the walls of room {}", room.name);
+            let remedy = format!("at most {DOOR_OFF_M} m; correct between, or the room");
+            return Err(source.refuse(Some(span), what, remedy));
+        }
+    }
+    Ok(Door { name: name.clone(), from, to, between })
+}
+
+fn gap(source: &Source<'_>, entry: &GapEntry, site: &Site) -> Result<Gap, Failure> {
+    let find = |said: &Spanned<String>| {
+        let name = said.as_ref().as_str();
+        site.doors.iter().position(|door| door.name == name).ok_or_else(|| {
+            let known: Vec<&str> = site.doors.iter().map(|door| door.name.as_str()).collect();
+            let remedy = format!("{}Doors here: {}", nearest(name, &known), known.join(", "));
+            source.refuse(Some(said.span()), format!("gap: no door {name:?}"), remedy)
+        })
+    };
+    let [first, second] = entry.between.as_ref();
+    let doors = [find(first)?, find(second)?];
+    let [shortest, longest] = *entry.seconds.as_ref();
+    let is_right = shortest >= 0.0 && shortest < longest && longest <= 3600.0;
+    if !is_right {
+        let what = format!(
+            "gap between {} and {}: seconds {shortest} to {longest}",
+            first.as_ref(),
+            second.as_ref()
+        );
+        return Err(source.refuse(Some(entry.seconds.span()), what, "shortest and longest, such as [2, 15]"));
+    }
+    if doors[0] == doors[1] {
+        let what = format!("gap from door {} to itself", first.as_ref());
+        return Err(source.refuse(Some(entry.between.span()), what, "name two doors"));
+    }
+    Ok(Gap { doors, seconds: [shortest, longest] })
+}
+
+/// Checks that every room can be reached from a room with a sensor, through doors, outside or gaps.
+fn all_reachable(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failure> {
+    let mut reached = site.watched();
+    if !reached.contains(&true) {
+        let place = site.sensors[0].place;
+        let what =
+            format!("no sensor is in a room: {} is at [{}, {}]", site.sensors[0].name, place[0], place[1]);
+        return Err(source.refuse(Some(file.sensor[0].pose.span()), what, "correct the poses, or the rooms"));
+    }
+    let mut outside = false;
+    loop {
+        let before = (reached.clone(), outside);
+        let mut join = |one: [Option<usize>; 2]| {
+            if one.iter().any(|room| room.map_or(outside, |room| reached[room])) {
+                for room in one {
+                    match room {
+                        Some(room) => reached[room] = true,
+                        None => outside = true,
+                    }
+                }
+            }
+        };
+        site.doors.iter().for_each(|door| join(door.rooms()));
+        for Gap { doors: [a, b], .. } in &site.gaps {
+            let (a, b) = (&site.doors[*a], &site.doors[*b]);
+            a.rooms().into_iter().for_each(|one| b.rooms().into_iter().for_each(|two| join([one, two])));
+        }
+        if before == (reached.clone(), outside) {
+            break;
+        }
+    }
+    match reached.iter().position(|reached| !reached) {
+        None => Ok(()),
+        Some(room) => {
+            let what =
+                format!("room {} cannot be reached: it has neither sensor nor door", site.rooms[room].name);
+            Err(source.refuse(Some(file.room[room].name.span()), what, "add [[door]], or leave the room out"))
+        }
+    }
 }

@@ -1,58 +1,79 @@
-//! From scans in the order of time to persons: association, birth, death, doors. Refuses to know how scans come in order.
-
-mod doors;
+//! Tracks people from scans in the order of their stamps: association of legs with tracks, track initiation and deletion, and
+//! people who go through doors or where no sensor looks.
 
 use scanhub_schema::{Foreground, Scan};
 
-use crate::track::assignment::{Assignment, Edge};
-use crate::track::filter::Side;
-use crate::track::geometry::{Point, distance, distance_to_segment, length2, minus};
-use crate::track::passage::LONGEST_S;
-use crate::track::person::{COARSE, Life, Person};
-use crate::track::picture::{Event, Kind, Misplaced, Picture, Track};
-use crate::track::poses::Poses;
-use crate::track::sight::{AtDoor, Leg, Seen, Sight};
-use crate::track::site::Site;
+use super::assignment::{Assignment, Edge};
+use super::geometry::{Point, distance, distance_to_segment, dot, length2, middle, minus};
+use super::passage::{ArrivedPerson, DepartedPerson, LONGEST_S};
+use super::person::{COARSE, Person, Side, TrackPhase};
+use super::pose_check::PoseVotes;
+use super::sensor_view::{AtDoor, Leg, SensorView, Visibility};
+use super::site::{Door, Gap, Site};
+use super::{Event, Kind, Misplaced, Picture, Track};
 
-/// The most persons at a time.
+/// Maximum number of people at a time.
 pub const PERSONS: usize = 64;
-/// Time between two pictures.
+/// Interval between pictures.
 pub const PICTURE_NS: u64 = 40_000_000;
 
-/// Gain of a leg exactly where it should be: what a leg's squared distance over its variance must be below.
+/// Gain of a leg exactly at its expected position, and limit of a leg's squared distance over its variance.
 const GATE: f64 = 11.0;
-/// Who is only tentative gives way.
+/// The same for a tentative person, who has lower priority.
 const GATE_TENTATIVE: f64 = 9.0;
-/// Legs farther from a person than this are not his.
+/// Maximum distance of a leg from its person.
 const FARTHEST_LEG_M: f64 = 0.8;
-/// The legs of a person are at most this far apart.
+/// Maximum distance between the legs of a person.
 const WIDEST_STEP_M: f64 = 0.9;
-/// Nobody is born so near to somebody who is known.
+/// Minimum distance of a new track from the legs of every track that is not away.
 const APART_M: f64 = 0.3;
-/// Who is seen through for so long is gone.
+/// Time after which a person is deleted whose position sensors see through.
 const GONE_S: f64 = 0.7;
 const GONE_TENTATIVE_S: f64 = 0.25;
-/// Who is tentative and not seen for so long is forgotten.
+/// Time after which a tentative person is deleted who is not seen.
 const FORGOTTEN_NS: u64 = 400_000_000;
-/// Who is hidden for so long is.
+/// Time after which a hidden person is deleted.
 const HIDDEN_NS: u64 = 120_000_000_000;
-/// Between two scans of the slowest sensor; what is longer is a gap.
+/// Maximum period of a sensor. A longer one is a gap.
 const SLOWEST_S: f64 = 0.2;
-/// Scans that are not farther apart show the same.
+/// Maximum time between two scans that show the same.
 const AT_ONCE_NS: u64 = 45_000_000;
-/// Two who are nearer, and of whom never two pairs of legs are seen, are one.
+/// Two people who are nearer to each other, and who never show two pairs of legs, are one.
 const SAME_M: f64 = 0.45;
 /// Time for which a known person who went into an ignored area may be associated with the legs in it.
 const IGNORED_NS: u64 = 5_000_000_000;
 
 /// A known person who was not seen for this time is not found again by a leg that may be a part of a leaf.
 const LEAF_NS: u64 = 300_000_000;
+/// Maximum distance from a door at which a person is first seen who comes out of it.
+const BEFORE_DOOR_M: f64 = 3.5;
+/// The same in a room with sensors, where they are seen as soon as they have come through.
+const INSIDE_DOOR_M: f64 = 1.2;
+/// Minimum distance behind a door of a person who has gone through it.
+const BEHIND_DOOR_M: f64 = 0.12;
+/// A person who is nearer to a confirmed one, and never shows two legs, is a part of them.
+const PART_M: f64 = 0.5;
+/// Maximum distance from a door at which a person is first seen who has come through it, in meters.
+const AT_DOOR_M: f64 = 0.7;
+/// This distance for a door with leaves, if the person walks away from it at least at the speed below, in m/s.
+const BEFORE_LEAVES_M: f64 = 1.6;
+const LEAVES_M_S: f64 = 0.2;
+/// A new person who is nearer to a known one may be one of their legs.
+const ALONE_M: f64 = 0.9;
+/// Maximum squared distance over variance of a new person who is a hidden one: 98.9 % of the normal distribution in
+/// the plane.
+const HIDDEN_GATE: f64 = 9.0;
+/// Time out of sight in a room without sensors after which a person is away.
+const AWAY_NS: u64 = 250_000_000;
 
-/// What follows persons.
+/// A door has leaves if this number of scans of a sensor in a row show it closed.
+const CLOSED_SCANS: u32 = 20;
+
+/// Tracks of people.
 pub(crate) struct Tracker {
     pub(crate) site: Site,
     watched: Vec<bool>,
-    pub(crate) sights: Vec<Sight>,
+    pub(crate) sights: Vec<SensorView>,
     pub(crate) persons: Vec<Person>,
     next_id: u64,
     events: Vec<Event>,
@@ -64,9 +85,10 @@ pub(crate) struct Tracker {
     has_leaves: Vec<bool>,
     /// Number of scans in a row of each sensor that showed each door closed.
     closed: Vec<Vec<u32>>,
-    poses: Poses,
+    poses: PoseVotes,
     misplaced: Vec<Misplaced>,
-    /// Legs that were seen where a person walks: how much later than expected, per sensor, summed.
+    /// For each sensor, from the legs of walking people: the sum of offset times velocity, and the sum of squared speeds.
+    /// The ratio is the mean time in seconds by which legs are ahead of their expected positions.
     pub(crate) lateness: Vec<(f64, f64)>,
 }
 
@@ -74,7 +96,7 @@ impl Tracker {
     pub(crate) fn new(site: Site) -> Tracker {
         Tracker {
             watched: site.watched(),
-            sights: site.sensors.iter().cloned().map(Sight::new).collect(),
+            sights: site.sensors.iter().cloned().map(SensorView::new).collect(),
             persons: Vec::with_capacity(PERSONS),
             next_id: 1,
             events: Vec::new(),
@@ -84,7 +106,7 @@ impl Tracker {
             scan_ns: vec![0; site.sensors.len()],
             has_leaves: vec![false; site.doors.len()],
             closed: vec![vec![0; site.doors.len()]; site.sensors.len()],
-            poses: Poses::new(site.sensors.len()),
+            poses: PoseVotes::new(site.sensors.len()),
             misplaced: Vec::new(),
             lateness: vec![(0.0, 0.0); site.sensors.len()],
             site,
@@ -99,19 +121,19 @@ impl Tracker {
         let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(SLOWEST_S);
         self.scan_ns[sensor] = at_ns;
         self.compare_poses(sensor, at_ns);
-        self.walk(at_ns);
+        self.predict(at_ns);
         let mut pairs = std::mem::take(&mut self.pairs);
         self.associate(sensor, at_ns, &mut pairs);
         self.correct(sensor, since_s, &pairs);
-        self.miss(sensor, since_s, &pairs);
-        self.bear(sensor, at_ns, &pairs);
+        self.handle_missed_detections(sensor, since_s, &pairs);
+        self.start_tracks(sensor, at_ns, &pairs);
         self.pairs = pairs;
         self.merge(at_ns);
-        self.pass(at_ns);
-        self.bury(at_ns);
+        self.detect_crossings(at_ns);
+        self.delete_lost_tracks(at_ns);
     }
 
-    /// A sensor that sees everybody beside where others see them is taken to sit beside its place.
+    /// Corrects the position of a sensor that sees all people next to the positions at which others see them.
     fn compare_poses(&mut self, sensor: usize, at_ns: u64) {
         for other in 0..self.sights.len() {
             if other == sensor || at_ns.saturating_sub(self.scan_ns[other]) > AT_ONCE_NS {
@@ -125,9 +147,10 @@ impl Tracker {
         }
     }
 
-    /// Moves everybody to `at_ns`; nobody who is not seen walks through a wall.
-    fn walk(&mut self, at_ns: u64) {
-        for person in self.persons.iter_mut().filter(|person| !matches!(person.life, Life::Away { .. })) {
+    /// Predicts all people at `at_ns`. A person who is not seen does not walk through a wall.
+    fn predict(&mut self, at_ns: u64) {
+        for person in self.persons.iter_mut().filter(|person| !matches!(person.life, TrackPhase::Away { .. }))
+        {
             let before = person.filter.place();
             person.predict(at_ns);
             if at_ns.saturating_sub(person.seen_ns) < 200_000_000 {
@@ -135,7 +158,7 @@ impl Tracker {
             }
             let (room, after) = (self.site.room_at(before), person.filter.place());
             if self.site.room_at(after) != room {
-                let door = |door: &crate::track::site::Door| distance_to_segment(before, door.between) < 0.4;
+                let door = |door: &Door| distance_to_segment(before, door.between) < 0.4;
                 if !self.site.doors.iter().any(door) {
                     person.filter.stop(before);
                 }
@@ -143,17 +166,18 @@ impl Tracker {
         }
     }
 
-    /// Finds whose legs the sensor sees: pairs of a leg and twice the number of a person plus the side.
+    /// Assigns the legs that the sensor sees to people: pairs of a leg, and twice the index of a person plus the
+    /// side.
     fn associate(&mut self, sensor: usize, at_ns: u64, pairs: &mut Vec<(usize, usize)>) {
         let legs = self.sights[sensor].legs();
         self.edges.clear();
         for (number, person) in self.persons.iter().enumerate() {
             let gate = match person.life {
-                Life::Away { .. } => continue,
-                Life::Tentative => GATE_TENTATIVE,
-                Life::Known => GATE,
+                TrackPhase::Away { .. } => continue,
+                TrackPhase::Tentative => GATE_TENTATIVE,
+                TrackPhase::Known => GATE,
             };
-            // What the background has learned holds who is known and stands, and makes nobody known.
+            // Learned background keeps a confirmed person who stands, but does not confirm one.
             let (place, stands) = (person.filter.place(), person.is_known() && person.speed() < 0.5);
             let passes = person.is_known() && at_ns.saturating_sub(person.free_ns) < IGNORED_NS;
             let is_lost = person.is_known() && at_ns.saturating_sub(person.seen_ns) > LEAF_NS;
@@ -180,7 +204,7 @@ impl Tracker {
         }
         pairs.clear();
         self.assignment.solve((legs.len(), 2 * self.persons.len()), &self.edges, pairs);
-        // By person, the surer leg first.
+        // By person, the more certain leg first.
         pairs.sort_unstable_by_key(|&(leg, place)| (place / 2, (legs[leg].sigma_m * 1e6) as u64, leg));
         let mut i = 1;
         while i < pairs.len() {
@@ -206,7 +230,7 @@ impl Tracker {
                 ahead += off[0] * velocity[0] + off[1] * velocity[1];
                 person.filter.correct(side, at, sigma_m);
             }
-            if of_one.len() == 2 && speed > 0.6 && person.life == Life::Known {
+            if of_one.len() == 2 && speed > 0.6 && person.life == TrackPhase::Known {
                 let (sum, weight) = &mut self.lateness[sensor];
                 *sum += ahead / 2.0;
                 *weight += speed * speed;
@@ -225,33 +249,33 @@ impl Tracker {
         }
     }
 
-    /// Who is not among `pairs` is hidden, or seen through.
-    fn miss(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
+    /// Updates the people without a leg in `pairs`: they are hidden, or the sensor sees through their positions.
+    fn handle_missed_detections(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
         let sight = &self.sights[sensor];
         for (number, person) in self.persons.iter_mut().enumerate() {
             let is_seen = |&(leg, place): &(usize, usize)| place / 2 == number && sight.legs()[leg].is_solid;
-            if matches!(person.life, Life::Away { .. }) || pairs.iter().any(is_seen) {
+            if matches!(person.life, TrackPhase::Away { .. }) || pairs.iter().any(is_seen) {
                 continue;
             }
             let place = person.filter.place();
             let sigma = person.filter.variance().sqrt();
             let share = if sigma < 0.25 {
                 match sight.look(place) {
-                    Seen::Through => 1.0,
-                    Seen::Here => {
-                        // What the background has learned still stands there.
+                    Visibility::Through => 1.0,
+                    Visibility::Here => {
+                        // A learned object still stands there.
                         if person.is_known() && person.speed() < 0.4 {
                             person.absent_s = (person.absent_s - COARSE * since_s).max(0.0);
                         }
                         0.0
                     }
-                    Seen::Hidden => 0.0,
+                    Visibility::Hidden => 0.0,
                 }
             } else {
                 let s = 1.2 * sigma;
                 let around = [[0.0, 0.0], [s, 0.0], [-s, 0.0], [0.0, s], [0.0, -s]];
                 let through =
-                    |off: &&Point| sight.look([place[0] + off[0], place[1] + off[1]]) == Seen::Through;
+                    |off: &&Point| sight.look([place[0] + off[0], place[1] + off[1]]) == Visibility::Through;
                 around.iter().filter(through).count() as f64 / 5.0
             };
             person.absent_s += share * since_s;
@@ -261,13 +285,13 @@ impl Tracker {
         }
     }
 
-    /// Legs of nobody are somebody's.
-    fn bear(&mut self, sensor: usize, at_ns: u64, pairs: &[(usize, usize)]) {
+    /// Starts a track for each leg, or pair of legs, that no track explains.
+    fn start_tracks(&mut self, sensor: usize, at_ns: u64, pairs: &[(usize, usize)]) {
         let legs = self.sights[sensor].legs();
         let near_known = |at: Point| {
             self.persons.iter().any(|person| {
                 let is_his = |side| distance(person.filter.leg(side).0, at) < APART_M;
-                !matches!(person.life, Life::Away { .. }) && Side::BOTH.into_iter().any(is_his)
+                !matches!(person.life, TrackPhase::Away { .. }) && Side::BOTH.into_iter().any(is_his)
             })
         };
         let mut free: Vec<usize> = (0..legs.len())
@@ -298,7 +322,7 @@ impl Tracker {
         }
     }
 
-    /// Two who share one pair of legs are one.
+    /// Merges two people who share one pair of legs.
     fn merge(&mut self, at_ns: u64) {
         let mut i = 0;
         while i < self.persons.len() {
@@ -308,8 +332,8 @@ impl Tracker {
                     return false;
                 }
                 let alone = one.both + other.both < 0.35;
-                let known =
-                    !matches!(one.life, Life::Away { .. }) && !matches!(other.life, Life::Away { .. });
+                let known = !matches!(one.life, TrackPhase::Away { .. })
+                    && !matches!(other.life, TrackPhase::Away { .. });
                 let grown = at_ns - other.born_ns > 600_000_000 && at_ns - one.born_ns > 600_000_000;
                 let unseen = (at_ns - one.seen_ns).max(at_ns - other.seen_ns) > 300_000_000;
                 let very_near = distance(one.filter.place(), other.filter.place()) < 0.2;
@@ -317,7 +341,7 @@ impl Tracker {
             };
             match (i + 1..self.persons.len()).find(|&j| is_same(&self.persons[j])) {
                 Some(other) => {
-                    // The one who was known first stays, with the filter of whom was seen last.
+                    // The person who was confirmed first stays, with the filter of the one who was seen last.
                     let (keep, drop) = if self.persons[other].is_known() && !self.persons[i].is_known() {
                         (other, i)
                     } else {
@@ -337,20 +361,23 @@ impl Tracker {
         }
     }
 
-    /// Who was seen through long enough is gone, and who was away too long.
-    fn bury(&mut self, at_ns: u64) {
+    /// Deletes people whose position sensors have seen through for long enough, and people who have been away for too
+    /// long.
+    fn delete_lost_tracks(&mut self, at_ns: u64) {
         let mut number = 0;
         while number < self.persons.len() {
             let person = &self.persons[number];
             let silent_ns = at_ns.saturating_sub(person.seen_ns);
             let (is_gone, is_told) = match person.life {
-                Life::Tentative => (person.absent_s > GONE_TENTATIVE_S || silent_ns > FORGOTTEN_NS, false),
-                Life::Known => {
+                TrackPhase::Tentative => {
+                    (person.absent_s > GONE_TENTATIVE_S || silent_ns > FORGOTTEN_NS, false)
+                }
+                TrackPhase::Known => {
                     let is_lost = at_ns.saturating_sub(person.free_ns) > IGNORED_NS
                         && self.site.is_ignored(person.filter.place());
                     (person.absent_s > GONE_S || silent_ns > HIDDEN_NS || is_lost, true)
                 }
-                Life::Away { since_ns, .. } => {
+                TrackPhase::Away { since_ns, .. } => {
                     let away_s = at_ns.saturating_sub(since_ns) as f64 * 1e-9;
                     (person.room.is_none() || away_s > 5.0 * LONGEST_S, true)
                 }
@@ -366,10 +393,10 @@ impl Tracker {
         }
     }
 
-    /// Elements for which there is memory.
+    /// Returns the number of elements that memory is allocated for.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
-        let sights: usize = self.sights.iter().map(Sight::capacity).sum();
+        let sights: usize = self.sights.iter().map(SensorView::capacity).sum();
         let lists = self.edges.capacity() + self.pairs.capacity() + self.assignment.capacity();
         sights + lists + self.persons.capacity() + self.events.capacity() + self.misplaced.capacity()
     }
@@ -379,7 +406,7 @@ impl Tracker {
         self.events.push(Event { wall_ns, id, room, kind });
     }
 
-    /// Writes the picture of `at_ns`, at which or before which the last scan was.
+    /// Writes the picture of `at_ns`, which is not before the last scan.
     pub(crate) fn show(&mut self, at_ns: u64, picture: &mut Picture) {
         picture.wall_ns = at_ns;
         picture.tracks.clear();
@@ -387,7 +414,7 @@ impl Tracker {
             let ahead = at_ns.saturating_sub(person.at_ns).min(200_000_000) as f64 * 1e-9;
             let (place, velocity) = (person.filter.place(), person.filter.velocity());
             let variance = person.filter.variance();
-            let is_away = matches!(person.life, Life::Away { .. });
+            let is_away = matches!(person.life, TrackPhase::Away { .. });
             let ahead = if is_away { 0.0 } else { ahead };
             Track {
                 id: person.id,
@@ -407,13 +434,188 @@ impl Tracker {
         picture.misplaced.clear();
         picture.misplaced.append(&mut self.misplaced);
     }
+
+    /// Finds the doors that have leaves. Only these are ever closed.
+    fn watch_leaves(&mut self, sensor: usize) {
+        let doors = self.site.doors.iter().zip(&mut self.has_leaves).zip(&mut self.closed[sensor]);
+        for ((door, has_leaves), closed) in doors.filter(|((_, has_leaves), _)| !**has_leaves) {
+            if self.sights[sensor].is_closed(door.between) {
+                *closed += 1;
+                *has_leaves = *closed >= CLOSED_SCANS;
+            } else {
+                *closed = 0;
+            }
+        }
+    }
+
+    /// Confirms people, and detects those who go through doors or where no sensor looks.
+    fn detect_crossings(&mut self, at_ns: u64) {
+        let mut number = 0;
+        while number < self.persons.len() {
+            let person = &self.persons[number];
+            if person.life == TrackPhase::Tentative {
+                if person.is_sure() && !self.is_part_of_another(number) {
+                    self.confirm(number, at_ns);
+                    continue;
+                }
+            } else if person.is_known() {
+                self.cross(number, at_ns);
+            }
+            number += 1;
+        }
+    }
+
+    /// Returns the hidden person in the same room who is most likely to have been at `place` at that time.
+    fn hidden_near(&self, place: Point, then_ns: u64) -> Option<usize> {
+        let room = self.site.room_at(place);
+        let off2 = |(number, person): (usize, &Person)| {
+            let is_hidden = person.is_known() && person.seen_ns + AWAY_NS < person.at_ns;
+            let is_he = is_hidden && person.seen_ns <= then_ns && person.room == room;
+            let off = distance(place, person.filter.place());
+            let off2 = off * off / (person.filter.variance() + 0.04);
+            (is_he && off2 < HIDDEN_GATE).then_some((off2, number))
+        };
+        let near = self.persons.iter().enumerate().filter_map(off2);
+        near.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, number)| number)
+    }
+
+    /// Returns whether a person is a leg of another person who is seen.
+    fn is_part_of_another(&self, number: usize) -> bool {
+        let one = &self.persons[number];
+        let near = |other: &Person| {
+            other.is_known()
+                && one.at_ns.saturating_sub(other.seen_ns) < AWAY_NS
+                && distance(one.filter.place(), other.filter.place()) < PART_M
+        };
+        one.both < 0.3 && self.persons.iter().any(near)
+    }
+
+    fn cross(&mut self, number: usize, at_ns: u64) {
+        let person = &self.persons[number];
+        let (place, from) = (person.filter.place(), person.room);
+        let to = self.site.room_at(place);
+        if to != from {
+            let joins = |&door: &usize| [[from, to], [to, from]].contains(&self.site.doors[door].rooms());
+            let door = self.site.nearest_door(place, joins);
+            let behind = |door: usize| distance_to_segment(place, self.site.doors[door].between);
+            match door.filter(|&door| behind(door) < 1.5) {
+                Some(door) if behind(door) > BEHIND_DOOR_M => {
+                    (self.persons[number].room, self.persons[number].came_by) = (to, Some(door));
+                    self.tell(at_ns, number, Kind::Door { door, from, to });
+                }
+                // The person was not seen at the door, or is in a wall.
+                None if to.is_some() && at_ns - person.seen_ns < AWAY_NS => {
+                    (self.persons[number].room, self.persons[number].came_by) = (to, None);
+                }
+                _ => {}
+            }
+        }
+        let person = &self.persons[number];
+        let is_watched = person.room.is_some_and(|room| self.watched[room]);
+        if !is_watched && at_ns - person.seen_ns > AWAY_NS {
+            let (room, place, since_ns) = (person.room, person.filter.place(), person.seen_ns);
+            let leads = |door: &usize| self.site.doors[*door].rooms().contains(&room);
+            let nearest = || self.site.nearest_door(place, leads);
+            if let Some(door) = person.came_by.filter(leads).or_else(nearest) {
+                self.persons[number].life = TrackPhase::Away { since_ns, door };
+            }
+        }
+    }
+
+    /// Returns whether a new person has come through a door that leads where no sensor looks: they were first seen at the door.
+    /// At a door with leaves, a person is not confirmed, so that they may be first seen at some distance. Then they have
+    /// come through it if they walk away from it, and are not a leg of someone who is known.
+    fn came_through(&self, number: usize, door: usize) -> bool {
+        let person = &self.persons[number];
+        let off_m = self.site.distance_to_door(person.born_at, door);
+        if off_m < AT_DOOR_M || !self.has_leaves[door] {
+            return off_m < AT_DOOR_M;
+        }
+        let (place, away) =
+            (person.filter.place(), minus(person.born_at, middle(self.site.doors[door].between)));
+        let walks_away = dot(away, person.filter.velocity()) > LEAVES_M_S * length2(away).sqrt();
+        let near = |other: &Person| other.is_known() && distance(other.filter.place(), place) < ALONE_M;
+        let is_alone = self.persons.iter().filter(|other| other.id != person.id).all(|other| !near(other));
+        off_m < BEFORE_LEAVES_M && walks_away && is_alone
+    }
+
+    /// Confirms a new person, who may be one who was away or hidden.
+    fn confirm(&mut self, number: usize, at_ns: u64) {
+        let new = &self.persons[number];
+        let (born_at, born_ns) = (new.born_at, new.born_ns);
+        let off = |door: usize| distance_to_segment(born_at, self.site.doors[door].between);
+        let is_inside = self.site.room_at(born_at).is_some_and(|room| self.watched[room]);
+        let before_door_m = if is_inside { INSIDE_DOOR_M } else { BEFORE_DOOR_M };
+        // All people who are away, with the door that they would have come out of.
+        let arrival = |(old, person): (usize, &Person)| {
+            let TrackPhase::Away { door: entry, .. } = person.life else { return None };
+            let exit = self.site.nearest_door(born_at, |door| {
+                let is_gap = |gap: &Gap| gap.doors.contains(&entry) && gap.doors.contains(door);
+                let leads = self.site.doors[*door].rooms().contains(&person.room);
+                (leads || self.site.gaps.iter().any(is_gap)) && off(*door) < before_door_m
+            })?;
+            let after_s = (born_ns as f64 - person.at_ns as f64) * 1e-9;
+            // A person who appeared while the other one was seen is a different one.
+            let way_m = distance(born_at, person.filter.place());
+            if after_s < -0.75 || after_s < -0.25 && way_m > 0.7 {
+                return None;
+            }
+            let gone = DepartedPerson {
+                entry: person.came_by,
+                at: person.filter.place(),
+                speed: person.speed(),
+                pace: person.pace,
+            };
+            let seen =
+                ArrivedPerson { exit, at: born_at, velocity: new.filter.velocity(), is_out: is_inside };
+            Some((self.site.likelihood(&gone, &seen, after_s), old, exit))
+        };
+        let best = self.persons.iter().enumerate().filter_map(arrival).max_by(|a, b| a.0.total_cmp(&b.0));
+        let best = best.filter(|best| best.0 > 1e-4).map(|(_, old, exit)| (old, Some(exit)));
+        match self.hidden_near(born_at, born_ns).map(|old| (old, None)).or(best) {
+            Some((old, exit)) => {
+                let mut new = self.persons.remove(number);
+                let old = if old > number { old - 1 } else { old };
+                let known = &mut self.persons[old];
+                let from = known.room;
+                (new.id, new.born_ns, new.pace, new.life) =
+                    (known.id, known.born_ns, known.pace, TrackPhase::Known);
+                new.room = self.site.room_at(new.filter.place()).or(new.room);
+                let to = new.room;
+                new.came_by = if from == to { known.came_by } else { exit };
+                self.persons[old] = new;
+                if let Some(door) = exit.filter(|_| from != to) {
+                    self.tell(at_ns, old, Kind::Door { door, from, to });
+                }
+            }
+            None => {
+                self.persons[number].life = TrackPhase::Known;
+                // A person who comes out of a door to where no sensor looks has come through it.
+                let leads = |&door: &usize| {
+                    let ends = self.site.doors[door].rooms();
+                    let is_unseen = |room: &Option<usize>| room.is_none_or(|room| !self.watched[room]);
+                    ends.contains(&self.persons[number].room) && ends.iter().any(is_unseen)
+                };
+                let came_by = |&door: &usize| self.came_through(number, door);
+                let door = (0..self.site.doors.len()).filter(leads).find(came_by);
+                let room = self.persons[number].room;
+                let is_watched = room.is_some_and(|room| self.watched[room]);
+                self.tell(at_ns, number, Kind::Appeared);
+                if let Some(door) = door.filter(|_| is_watched) {
+                    let ends = self.site.doors[door].rooms();
+                    let from = if ends[0] == room { ends[1] } else { ends[0] };
+                    self.tell(at_ns, number, Kind::Door { door, from, to: room });
+                }
+            }
+        }
+    }
 }
 
 /// Returns whether a leg may be a part of a leaf of a door.
 fn may_be_leaf(leg: &Leg) -> bool {
     match leg.at_door {
         AtDoor::Clear => false,
-        AtDoor::Swing => !leg.is_free,
+        AtDoor::ReversalDetector => !leg.is_free,
         AtDoor::Line | AtDoor::Jamb => true,
     }
 }

@@ -1,251 +1,589 @@
-//! `scanhub tilt`: three dimensions of a scanner on a mount, as lines and as topics. Refuses to know how points and obstacles
-//! are found.
+//! `scanhub tilt`: computes three dimensions with a scanner on a mount, and prints and publishes points and obstacles.
 
-mod check;
-mod lines;
-mod publish;
-
-use std::io::Write;
-use std::rc::Rc;
+use std::io::{self, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::time::Duration;
 
-use crate::tilt::{Angle, Check, Mount, Settings, Sweep, Tilting, Withheld};
-use publish::Samples;
+use clap::Args;
 use scanhub_client::streams::Sample;
-use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Cloud, CloudHead, CloudPoint, Failure, Header, Kind, Obstacles, Topic, Wake};
 use scanhub_shm::Domain;
-
-use scanhub_verbs::follow::ReceiveStats;
-use scanhub_verbs::follow::{Bounds, Notice, Sink, follow};
+use scanhub_verbs::follow::{Bounds, Event, Following};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::output::{End, Output, quiet};
-use scanhub_verbs::{json, text};
+use scanhub_verbs::output::{End, quiet};
+use scanhub_verbs::{duration, json, text};
+use serde::{Serialize, Serializer};
 
-/// What `tilt` is asked for.
-#[derive(Clone, Debug)]
-pub struct TiltOptions {
-    /// The scanner.
-    pub sensor: String,
-    /// The name under which the angles of its mount are published.
-    pub angles: String,
-    /// The name that its topics are published under; none: it publishes nothing.
-    pub name: Option<String>,
-    /// Where the axis is, and the scanner on it.
-    pub mount: Mount,
-    /// How sweeps, background and obstacles are found.
-    pub settings: Settings,
-    /// Whether it only checks the description of the mount, and ends.
-    pub check: bool,
-    /// Lines of JSON.
-    pub json: bool,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+use super::own_name;
+use super::results::{Results, Topics};
+use crate::tilt::{Angle, Check, Counts, Mount, Point, Settings, Sweep, TiltScanner, Withheld};
+
+/// Arguments of `tilt`.
+#[derive(Args, Clone, Debug)]
+pub struct TiltArgs {
+    /// The scanner
+    #[arg(value_name = "SENSOR")]
+    sensor: String,
+    /// Name under which a program publishes the angles of the mount
+    #[arg(long, value_name = "MOUNT", value_parser = own_name)]
+    angles: String,
+    /// Also publish the topics NAME/cloud and NAME/obstacles. NAME must not be in use
+    #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
+    name: Option<String>,
+    /// A point of the mount's axis in the robot's frame, in metres: x ahead, y left, z above the floor
+    #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
+    axis_at: [f64; 3],
+    /// Direction of the mount's axis. Angles are right-handed: around y, a larger angle tilts the scanner down
+    #[arg(long, default_value = "0,1,0", value_name = "X,Y,Z", value_parser = axis, allow_hyphen_values = true)]
+    axis: [f64; 3],
+    /// Where the beams come from while the mount is level [default: the point of --axis-at]
+    #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
+    sensor_at: Option<[f64; 3]>,
+    /// Angle of the mount at which the scanner measures level
+    #[arg(long, default_value_t = 0.0, value_name = "RADIANS", value_parser = number, allow_hyphen_values = true)]
+    level: f64,
+    /// Where the scanner looks while the mount is level, counter-clockwise from ahead
+    #[arg(long, default_value_t = 0.0, value_name = "RADIANS", value_parser = number, allow_hyphen_values = true)]
+    yaw: f64,
+    /// The scanner hangs
+    #[arg(long)]
+    upside_down: bool,
+    /// Report every object in this box, even if it is background: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z, in meters
+    #[arg(long, value_name = "X,X,Y,Y,Z,Z", value_parser = cuboid, allow_hyphen_values = true)]
+    near: Option<[[f64; 2]; 3]>,
+    /// Sweeps in which a surface must be seen before it is background
+    #[arg(long, default_value_t = Settings::default().sweeps, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    sweeps: u16,
+    /// Only check axis, arm and level against a flat floor and a wall ahead, and exit: with 5 if one of them is wrong
+    #[arg(long, conflicts_with_all = ["name", "near"])]
+    check: bool,
+    /// Stop after this time, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// Exit with 3 after this time without a scan and without an angle
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    timeout: Option<Duration>,
 }
 
-/// Follows the scans of a sensor and the angles of its mount, and writes to `out` what stands there, sweep by sweep; what is
-/// wrong with the angles, and what is neither, to `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached,
-/// `stop` is set, or nobody reads any more.
-///
-/// # Errors
-///
-/// [`Kind::NoTopic`](scanhub_schema::Kind) with the sensors that there are, [`Kind::NoHub`](scanhub_schema::Kind) if bounded and there is none
-/// at the start, [`Kind::Timeout`](scanhub_schema::Kind), [`Kind::Interrupted`](scanhub_schema::Kind) if bounded and `stop` came first; those of
-/// publishing if it has a name. [`Kind::Check`](scanhub_schema::Kind) if a check has failed, and
-/// [`Kind::Interrupted`](scanhub_schema::Kind) or [`Kind::Timeout`](scanhub_schema::Kind) if it ended too early.
-pub fn tilt(
-    options: &TiltOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let names = [(&options.sensor, Topic::Scan), (&options.angles, Topic::Tilt)]
-        .map(|(sensor, topic)| TopicName { sensor: sensor.clone(), topic });
-    let name = options.name.as_deref().unwrap_or(UNNAMED);
-    let mut verb = Verb {
-        options,
-        tilting: Tilting::new(options.mount, options.settings),
-        trouble: Trouble::default(),
-        late_ns: 0,
-        check: options.check.then(Check::default),
-        teller: Teller {
-            name,
-            is_json: options.json,
-            samples: Samples::new(name),
-            told: Ok(()),
-            out: Output::new(out),
-            notes: Output::new(notes),
-        },
-        beams: None,
-        missed: 0,
-        summaries: names.len(),
-    };
-    let followed = follow(&names, &[], &options.places, &options.bounds, stop, &mut verb);
-    let Verb { check: Some(check), teller, .. } = &mut verb else { return quiet(followed) };
-    if check.sweeps() < check::SWEEPS {
-        quiet(followed)?;
-        let message = format!("the check ended after {} of {} whole sweeps", check.sweeps(), check::SWEEPS);
-        let kind = if stop.load(Ordering::Relaxed) { Kind::Interrupted } else { Kind::Timeout };
-        return Err(Failure::new(kind, message, "let it run until it ends by itself"));
+fn number(text: &str) -> Result<f64, String> {
+    let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
+    number.ok_or_else(|| format!("{text:?} is not a number"))
+}
+
+/// Parses `N` numbers with commas between them.
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers = text.split(',').map(number).collect::<Result<Vec<_>, _>>()?;
+    numbers.try_into().map_err(|numbers: Vec<_>| format!("expected {N} numbers, found {}", numbers.len()))
+}
+
+fn axis(text: &str) -> Result<[f64; 3], String> {
+    let axis = numbers(text)?;
+    if axis == [0.0; 3] {
+        Err("the axis must not be 0,0,0; for example, 0,1,0 points from right to left".into())
+    } else {
+        Ok(axis)
     }
-    quiet(check::tell(check, &options.mount, name, options.json, &mut teller.out))
 }
 
-/// What lines call one that publishes nothing.
-const UNNAMED: &str = "tilted";
-/// What is wrong with the angles for less than this time is counted, and not told.
-const TOLD_AFTER_NS: u64 = 300_000_000;
-
-struct Verb<'a> {
-    options: &'a TiltOptions,
-    tilting: Tilting,
-    trouble: Trouble,
-    /// The delay of the angles' stamps that was reported.
-    late_ns: i64,
-    check: Option<Check>,
-    teller: Teller<'a>,
-    /// Of the first scan.
-    beams: Option<usize>,
-    missed: u64,
-    /// Topics that are not yet over.
-    summaries: usize,
-}
-
-impl Sink for Verb<'_> {
-    /// Publishes from the moment that it is known how long samples are.
-    fn tick(&mut self, _: Instant) -> Result<(), End> {
-        let samples = &mut self.teller.samples;
-        match (&self.options.name, self.beams) {
-            (Some(name), Some(beams)) if !samples.is_published() => {
-                Ok(samples.publish(name, beams, &self.options.places)?)
-            }
-            _ => Ok(()),
+fn cuboid(text: &str) -> Result<[[f64; 2]; 3], String> {
+    let [x, to_x, y, to_y, z, to_z] = numbers(text)?;
+    let cuboid = [[x, to_x], [y, to_y], [z, to_z]];
+    match cuboid.iter().all(|[from, to]| from < to) {
+        true => Ok(cuboid),
+        false => {
+            Err("each minimum must be less than its maximum: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z".into())
         }
     }
+}
 
-    fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
-        let Verb { tilting, teller, check, .. } = self;
+impl TiltArgs {
+    /// Subscribes to the scans of the sensor and the angles of its mount in the first live domain of `places`. Writes the
+    /// obstacles of each sweep to `out`. Without `json`, reports about the angles and notices go to `notes` (stderr). Ends at
+    /// the limits, when `stop` is set, or when the reader of `out` has closed it.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::NoTopic`] if the sensor or the mount does not exist; the message lists the sensors.
+    /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run or a check ended.
+    /// - [`Kind::Check`] if a check has failed.
+    /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let names = [(&self.sensor, Topic::Scan), (&self.angles, Topic::Tilt)]
+            .map(|(sensor, topic)| TopicName { sensor: sensor.clone(), topic });
+        let mount = Mount {
+            axis_at: self.axis_at,
+            axis: self.axis,
+            level_rad: self.level,
+            sensor_at: self.sensor_at.unwrap_or(self.axis_at),
+            yaw_rad: self.yaw,
+            is_upside_down: self.upside_down,
+        };
+        let settings = Settings { sweeps: self.sweeps, near: self.near, ..Settings::default() };
+        let bounds = Bounds { count: None, run_for: self.run_for, timeout: self.timeout };
+        let name = self.name.as_deref().unwrap_or(UNNAMED);
+        let mut run = TiltRun {
+            args: self,
+            places,
+            scanner: TiltScanner::new(mount, settings),
+            problem: ProblemFilter::default(),
+            late_ns: 0,
+            check: self.check.then(Check::default),
+            beams: None,
+            writer: SweepWriter {
+                results: Results::new(name, json, out, notes),
+                to_wall_ns: 0,
+                obstacles: Box::default(),
+                written: Ok(()),
+            },
+        };
+        let followed = run.follow(&mut Following::new(&names, &[], places, &bounds, stop));
+        let TiltRun { check: Some(check), writer, .. } = &mut run else { return quiet(followed) };
+        if check.sweeps() < CHECKED_SWEEPS {
+            quiet(followed)?;
+            let message =
+                format!("the check ended after {} of {CHECKED_SWEEPS} whole sweeps", check.sweeps());
+            let kind = if stop.load(Ordering::Relaxed) { Kind::Interrupted } else { Kind::Timeout };
+            return Err(Failure::new(kind, message, "let it run until it ends by itself"));
+        }
+        quiet(write_findings(check, &mount, &mut writer.results))
+    }
+}
+
+/// Name in the lines of a run that publishes nothing.
+const UNNAMED: &str = "tilted";
+/// Minimum duration of a problem with the angles that is reported. A shorter one is only counted.
+const REPORTED_AFTER_NS: u64 = 300_000_000;
+
+struct TiltRun<'a> {
+    args: &'a TiltArgs,
+    places: &'a [Domain],
+    scanner: TiltScanner,
+    problem: ProblemFilter,
+    /// Delay of the angles' stamps that was reported.
+    late_ns: i64,
+    check: Option<Check>,
+    /// Number of beams of the first scan, once it has arrived.
+    beams: Option<usize>,
+    writer: SweepWriter<'a>,
+}
+
+impl TiltRun<'_> {
+    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        let end = self.take_events(following);
+        if self.check.is_none() && !matches!(end, Err(End::ReaderGone)) {
+            self.sum_up()?;
+        }
+        end
+    }
+
+    fn take_events(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                Event::Sample(_, sample, _) => self.sample(&sample)?,
+                Event::Notice(names, notice) => self.writer.results.notice(&names, &notice)?,
+                Event::Tick(_) => self.publish()?,
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Publishes as soon as the number of beams is known, which limits the length of samples.
+    fn publish(&mut self) -> Result<(), End> {
+        let results = &mut self.writer.results;
+        if let (Some(_), Some(beams), None) = (&self.args.name, self.beams, &results.topics) {
+            results.publish(TopicLimits { beams, ..TopicLimits::default() }, self.places)?;
+        }
+        Ok(())
+    }
+
+    fn sample(&mut self, sample: &Sample) -> Result<(), End> {
+        let TiltRun { scanner, writer, check, .. } = self;
         let mut take = |sweep: &Sweep<'_>| match check {
             Some(check) => check.take(sweep),
-            None => teller.tell(sweep),
+            None => writer.write(sweep),
         };
         match sample {
             Sample::Scan(scan) => {
-                let header = *scan.header();
+                let header = scan.header();
                 self.beams.get_or_insert(scan.beams());
-                tilting.take_scan(header.stamp_first_ns, scan, &mut take);
-                teller.samples.hear(&header);
-                if let Some(trouble) = self.trouble.changed(header.stamp_first_ns, tilting.trouble()) {
-                    teller.tell_trouble(trouble, tilting.late_ns())?;
+                scanner.take_scan(header.stamp_first_ns, scan, &mut take);
+                writer.to_wall_ns = header.wall_ns.wrapping_sub(header.stamp_last_ns) as i64;
+                writer.results.take_flags(header);
+                if let Some(problem) = self.problem.changed(header.stamp_first_ns, scanner.trouble()) {
+                    writer.write_angles(problem, scanner.late_ns(), None)?;
                 }
             }
-            Sample::Tilt(said) => {
-                let angle = Angle {
-                    stamp_ns: said.header().stamp_first_ns,
-                    angle_rad: said.angle_rad,
-                    rate_rad_s: said.rate_rad_s,
-                };
-                tilting.take_angle(angle, &mut take);
+            Sample::Tilt(tilt) => {
+                let stamp_ns = tilt.header().stamp_first_ns;
+                let angle = Angle { stamp_ns, angle_rad: tilt.angle_rad, rate_rad_s: tilt.rate_rad_s };
+                scanner.take_angle(angle, &mut take);
             }
             _ => {}
         }
-        if tilting.late_ns() != self.late_ns {
-            self.late_ns = tilting.late_ns();
-            teller.tell_late(&self.options.angles, self.trouble.told, self.late_ns)?;
+        if scanner.late_ns() != self.late_ns {
+            self.late_ns = scanner.late_ns();
+            writer.write_angles(self.problem.reported, self.late_ns, Some(&self.args.angles))?;
         }
-        if check.as_ref().is_some_and(|check| check.sweeps() >= check::SWEEPS) {
+        if check.as_ref().is_some_and(|check| check.sweeps() >= CHECKED_SWEEPS) {
             // Ends without a summary.
             return Err(End::ReaderGone);
         }
-        std::mem::replace(&mut teller.told, Ok(()))
+        std::mem::replace(&mut writer.written, Ok(()))
     }
 
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
-        if let Notice::Missed(count) = notice {
-            self.missed += count;
-        }
-        notice.tell(names, self.teller.is_json, &mut self.teller.out, &mut self.teller.notes)
-    }
-
-    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
-        self.summaries -= 1;
-        if self.summaries > 0 || self.check.is_some() {
-            return Ok(());
-        }
-        let Teller { name, is_json, samples, out, .. } = &mut self.teller;
-        let sum = lines::Sum {
-            counts: self.tilting.counts(),
-            late_ns: self.tilting.late_ns(),
-            missed: self.missed,
-            failed: samples.failed(),
+    fn sum_up(&mut self) -> Result<(), End> {
+        let results = &mut self.writer.results;
+        let line = Line::Summary {
+            sensor: results.name,
+            counts: self.scanner.counts(),
+            missed: results.missed,
+            failed: results.failed(),
+            late_ns: self.scanner.late_ns(),
         };
-        match is_json {
-            true => out.json(&lines::summary(name, &sum)),
-            false => out.line(|line| lines::summary_text(line, &sum)),
-        }
+        results.result(&line, |out| line.text(out))
     }
 }
 
-/// What is wrong with the angles, once it has been so for a while.
+/// Filters out short problems with the angles.
 #[derive(Default)]
-struct Trouble {
-    told: Option<Withheld>,
+struct ProblemFilter {
+    reported: Option<Withheld>,
     now: Option<Withheld>,
     since_ns: u64,
 }
 
-impl Trouble {
-    /// Takes what is so at the time of a scan; what is to be told, if it is news.
+impl ProblemFilter {
+    /// Takes the problem at the time of a scan. Returns the problem, or its end, if it must be reported now.
     fn changed(&mut self, stamp_ns: u64, now: Option<Withheld>) -> Option<Option<Withheld>> {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
         }
-        let is_old = stamp_ns.saturating_sub(self.since_ns) >= TOLD_AFTER_NS;
-        (is_old && now != self.told).then(|| {
-            self.told = now;
+        let is_old = stamp_ns.saturating_sub(self.since_ns) >= REPORTED_AFTER_NS;
+        (is_old && now != self.reported).then(|| {
+            self.reported = now;
             now
         })
     }
 }
 
-/// What writes the lines.
-struct Teller<'a> {
-    name: &'a str,
-    is_json: bool,
-    samples: Samples,
-    /// Why it could not.
-    told: Result<(), End>,
-    out: Output<'a>,
-    notes: Output<'a>,
+/// Writes and publishes sweeps.
+struct SweepWriter<'a> {
+    results: Results<'a, Cloud, Obstacles>,
+    /// Offset from CLOCK_MONOTONIC to the wall clock, in ns.
+    to_wall_ns: i64,
+    /// Obstacles of the last sweep.
+    obstacles: Box<Obstacles>,
+    /// The first error since the last sample.
+    written: Result<(), End>,
 }
 
-impl Teller<'_> {
-    fn tell(&mut self, sweep: &Sweep<'_>) {
-        let (header, obstacles) = self.samples.take(sweep);
-        let told = match self.is_json {
-            true => self.out.json(&json::obstacles(self.name, header, obstacles)),
-            false => self.out.line(|line| text::obstacles(line, header, obstacles)),
+impl SweepWriter<'_> {
+    fn write(&mut self, sweep: &Sweep<'_>) {
+        let header = self.publish(sweep);
+        let SweepWriter { results, obstacles, .. } = self;
+        let line = json::obstacles(results.name, &header, obstacles);
+        let written = results.result(&line, |out| text::obstacles(out, &header, obstacles));
+        if self.written.is_ok() {
+            self.written = written;
+        }
+    }
+
+    /// Stores the obstacles of a sweep, and publishes the sweep if topics exist. Returns the header of the obstacles.
+    fn publish(&mut self, sweep: &Sweep<'_>) -> Header {
+        let flags = if sweep.is_complete { Obstacles::COMPLETE } else { 0 }
+            | if sweep.is_doubted { Obstacles::DOUBTED } else { 0 };
+        *self.obstacles = Obstacles {
+            sweep: sweep.number,
+            generation: sweep.generation,
+            left_out: sweep.left_out,
+            flags,
+            ..Obstacles::default()
         };
-        if self.told.is_ok() {
-            self.told = told;
+        sweep.obstacles.iter().for_each(|one| self.obstacles.push(*one));
+        let (shared, to_wall_ns) = (self.results.header, self.to_wall_ns);
+        let header_of = |seq, from_ns, until_ns: u64| Header {
+            seq,
+            topic_seq: seq,
+            stamp_first_ns: from_ns,
+            stamp_last_ns: until_ns,
+            wall_ns: until_ns.wrapping_add_signed(to_wall_ns),
+            ..shared
+        };
+        let header = header_of(sweep.number.into(), sweep.from_ns, sweep.until_ns);
+        let Some(Topics { publications: (cloud, obstacles), sensor }) = &mut self.results.topics else {
+            return header;
+        };
+        let mut scans = scans(sweep.points, sensor.limits().beams).peekable();
+        let mut first = Cloud::FIRST;
+        while let Some(points) = scans.next() {
+            let last = if scans.peek().is_none() { Cloud::LAST } else { 0 };
+            let head = CloudHead {
+                sweep: sweep.number,
+                generation: sweep.generation,
+                count: points.len() as u16,
+                flags: flags | std::mem::take(&mut first) | last,
+                ..CloudHead::default()
+            };
+            if cloud.subscribers() == 0 {
+                cloud.skip(1);
+                continue;
+            }
+            let times = || points.iter().map(|point| point.stamp_ns);
+            let (from_ns, until_ns) = (times().min().unwrap_or(0), times().max().unwrap_or(0));
+            let header = header_of(cloud.next_number(), from_ns, until_ns);
+            // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.
+            let _ = cloud.send_len_with(&header, Cloud::len(points.len()), |sample| {
+                for (place, point) in sample.begin(head).iter_mut().zip(points) {
+                    *place = CloudPoint {
+                        at: point.at,
+                        beam: point.beam,
+                        point_class: point.class as u8,
+                        ..CloudPoint::default()
+                    };
+                }
+            });
         }
+        let _ = obstacles.send_with(&header, |sample| *sample = *self.obstacles);
+        let _ = sensor.wake(Wake::Telegram);
+        header
     }
 
-    fn tell_trouble(&mut self, trouble: Option<Withheld>, late_ns: i64) -> Result<(), End> {
-        match self.is_json {
-            true => self.out.json(&lines::angles(self.name, trouble, late_ns)),
-            false => self.notes.line(|line| lines::angles_text(line, trouble)),
-        }
+    /// Reports a problem with the angles, its end, or with `mount` a new delay of their stamps.
+    fn write_angles(
+        &mut self,
+        trouble: Option<Withheld>,
+        late_ns: i64,
+        mount: Option<&str>,
+    ) -> Result<(), End> {
+        let line = Line::Angles { sensor: self.results.name, trouble, late_ns, mount };
+        self.results.note(&line, |out| line.text(out))
     }
+}
 
-    fn tell_late(&mut self, mount: &str, trouble: Option<Withheld>, late_ns: i64) -> Result<(), End> {
-        match self.is_json {
-            true => self.out.json(&lines::angles(self.name, trouble, late_ns)),
-            false => self.notes.line(|line| lines::late_text(line, mount, late_ns)),
+/// Returns the points of each scan, at most `most` together. Beam numbers grow within a scan.
+fn scans(points: &[Point], most: usize) -> impl Iterator<Item = &[Point]> {
+    points.chunk_by(|one, next| one.beam < next.beam).flat_map(move |scan| scan.chunks(most.max(1)))
+}
+
+/// The lines that only `tilt` has. The variant is the class.
+#[derive(Serialize)]
+#[serde(tag = "class", rename_all = "snake_case")]
+enum Line<'a> {
+    Angles {
+        sensor: &'a str,
+        trouble: Option<Withheld>,
+        #[serde(rename = "late_ms", serialize_with = "milliseconds")]
+        late_ns: i64,
+        /// Name of the mount if the line reports a new delay.
+        #[serde(skip)]
+        mount: Option<&'a str>,
+    },
+    TiltCheck(Finding<'a>),
+    Summary {
+        sensor: &'a str,
+        #[serde(flatten)]
+        counts: Counts,
+        missed: u64,
+        /// Samples that were not published because memory was short.
+        failed: u64,
+        #[serde(rename = "late_ms", serialize_with = "milliseconds")]
+        late_ns: i64,
+    },
+}
+
+impl Line<'_> {
+    fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
+        match self {
+            Line::Angles { mount: Some(mount), late_ns, .. } => write!(
+                out,
+                "the stamps of {mount}/tilt are {}, or its gears have play: corrected. Publish each angle with the time of \
+                 its measurement",
+                lateness(*late_ns)
+            ),
+            Line::Angles { trouble, .. } => {
+                let text = match trouble {
+                    None => "the angles are well again",
+                    Some(Withheld::Silent) => {
+                        "no points: no angles come, or too late; is the program that publishes them running, and its clock \
+                         right?"
+                    }
+                    Some(Withheld::Jumped) => "no points: the angles have jumped",
+                    Some(Withheld::Inconsistent) => {
+                        "no points: the angles are not those that their rates say"
+                    }
+                    Some(Withheld::Standing) => "no points: the mount stands, or its encoder hangs",
+                };
+                out.write_all(text.as_bytes())
+            }
+            Line::TiltCheck(Finding { name, state, finding, remedy, .. }) => {
+                write!(out, "{state:<8} {name}: {finding}")?;
+                if remedy.is_empty() { Ok(()) } else { write!(out, "; {remedy}") }
+            }
+            Line::Summary { counts, missed, failed, late_ns, .. } => {
+                let Counts { sweeps, incomplete, doubted, scans, points, angles, .. } = counts;
+                write!(
+                    out,
+                    "{sweeps} sweeps ({incomplete} incomplete, {doubted} doubted) of {scans} scans, "
+                )?;
+                let [silent, jumped, inconsistent, standing] = counts.withheld;
+                write!(out, "{points} points; withheld: {silent} without an angle, {jumped} jumped, ")?;
+                write!(out, "{inconsistent} inconsistent, {standing} standing; {angles} angles; left out: ")?;
+                let Counts { angles_unordered, angles_ahead, angles_unfit, .. } = counts;
+                write!(
+                    out,
+                    "{angles_unordered} late, {angles_ahead} ahead, {angles_unfit} unfit, {missed} missed"
+                )?;
+                if *late_ns != 0 {
+                    write!(out, "; stamps of angles {}, corrected", lateness(*late_ns))?;
+                }
+                if *failed > 0 { write!(out, "; {failed} not published: no memory") } else { Ok(()) }
+            }
         }
     }
+}
+
+/// Returns milliseconds with one decimal.
+fn late_ms(late_ns: i64) -> f64 {
+    (late_ns as f64 / 1e5).round() / 10.0
+}
+
+fn milliseconds<S: Serializer>(late_ns: &i64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(late_ms(*late_ns))
+}
+
+/// Returns the delay of stamps as text.
+fn lateness(late_ns: i64) -> String {
+    format!("{:.1} ms {}", late_ms(late_ns).abs(), if late_ns < 0 { "early" } else { "late" })
+}
+
+/// Number of complete sweeps that a check takes.
+const CHECKED_SWEEPS: u32 = 6;
+/// Maximum error of the height, in meters.
+const HEIGHT_M: f64 = 0.02;
+/// Maximum error of the level and of the roll, in degrees.
+const LEVEL_DEG: f64 = 0.3;
+/// Maximum lean of a wall that the level does not explain, in degrees.
+const LEAN_DEG: f64 = 0.5;
+
+/// Result of one item of a check.
+#[derive(Serialize)]
+struct Finding<'a> {
+    sensor: &'a str,
+    name: &'static str,
+    state: &'static str,
+    off_m: Option<f64>,
+    off_deg: Option<f64>,
+    finding: String,
+    remedy: String,
+}
+
+/// Writes a line for each item of a check.
+///
+/// # Errors
+///
+/// Returns [`Kind::Check`] if an item has failed.
+fn write_findings(
+    check: &Check,
+    mount: &Mount,
+    results: &mut Results<'_, Cloud, Obstacles>,
+) -> Result<(), End> {
+    let findings = find(check, mount, results.name);
+    let has_failed = findings.iter().any(|finding| finding.state == "failed");
+    for finding in findings {
+        let line = Line::TiltCheck(finding);
+        results.result(&line, |out| line.text(out))?;
+    }
+    if has_failed {
+        let message = "the flags do not describe the mount";
+        let hint = "its remedy is printed below each item that failed";
+        return Err(Failure::new(Kind::Check, message, hint).into());
+    }
+    Ok(())
+}
+
+/// Returns the result of each item of a check.
+fn find<'a>(check: &Check, mount: &Mount, sensor: &'a str) -> Vec<Finding<'a>> {
+    let item =
+        |name, off_m: Option<f64>, off_deg: Option<f64>, is_ok: bool, finding: String, remedy: String| {
+            let (state, remedy) = if is_ok { ("ok", String::new()) } else { ("failed", remedy) };
+            Finding { sensor, name, state, off_m, off_deg, finding, remedy }
+        };
+    let Some(floor) = check.floor(mount) else {
+        let remedy =
+            "let the mount swing over a flat floor that is free within 3 m, and check --axis-at and --level";
+        return vec![item(
+            "floor",
+            None,
+            None,
+            false,
+            "there is no flat floor near height 0".into(),
+            remedy.into(),
+        )];
+    };
+    let moved = |at: [f64; 3]| format!("{:.3},{:.3},{:.3}", at[0], at[1], at[2] - floor.height_m);
+    let [level_deg, roll_deg] = [floor.level_rad, floor.roll_rad].map(f64::to_degrees);
+    let mut findings = vec![
+        item(
+            "floor",
+            Some(floor.height_m),
+            None,
+            floor.height_m.abs() <= HEIGHT_M,
+            format!(
+                "its height is {:.3} m, from {} points with a standard deviation of {:.3} m",
+                floor.height_m, floor.points, floor.deviation_m
+            ),
+            format!("--axis-at {} --sensor-at {}", moved(mount.axis_at), moved(mount.sensor_at)),
+        ),
+        item(
+            "level",
+            None,
+            Some(level_deg),
+            level_deg.abs() <= LEVEL_DEG,
+            format!("the floor rises by {level_deg:.2} degrees in the direction in which the mount tilts"),
+            format!("--level {:.4}", mount.level_rad - floor.level_rad),
+        ),
+        item(
+            "axis",
+            None,
+            Some(roll_deg),
+            roll_deg.abs() <= LEVEL_DEG,
+            format!("the floor rises by {roll_deg:.2} degrees along the axis"),
+            "level axis and scanner across, or describe the axis with --axis".into(),
+        ),
+    ];
+    findings.push(match check.wall() {
+        None => Finding {
+            state: "skipped",
+            remedy: "let the mount swing in front of an upright wall within 6 m, at least 0.7 m high".into(),
+            ..item("arm", None, None, true, "there is no wall ahead".into(), String::new())
+        },
+        Some(wall) => {
+            let off_deg = (wall.lean_rad + floor.level_rad).to_degrees();
+            item(
+                "arm",
+                None,
+                Some(off_deg),
+                off_deg.abs() <= LEAN_DEG,
+                format!(
+                    "the wall at {:.2} m leans by {off_deg:.2} degrees more than the floor explains, from {} points with a \
+                     standard deviation of {:.3} m",
+                    wall.distance_m, wall.points, wall.deviation_m
+                ),
+                "measure again from the axis to the scanner (--sensor-at), and check whether the wall is upright".into(),
+            )
+        }
+    });
+    findings
 }
 
 #[cfg(test)]
@@ -253,19 +591,39 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_wrong_for_a_moment_is_not_told() {
+    fn short_problems_are_not_reported() {
         const MS: u64 = 1_000_000;
-        let mut trouble = Trouble::default();
+        let mut problem = ProblemFilter::default();
         let (well, silent, jumped) = (None, Some(Withheld::Silent), Some(Withheld::Jumped));
         // At the start no angle has come yet.
-        assert_eq!(trouble.changed(1000 * MS, silent), None);
-        assert_eq!(trouble.changed(1027 * MS, well), None);
-        assert_eq!(trouble.changed(1400 * MS, silent), None);
-        assert_eq!(trouble.changed(1690 * MS, silent), None);
-        assert_eq!(trouble.changed(1700 * MS, silent), Some(silent));
-        assert_eq!(trouble.changed(1800 * MS, silent), None, "once");
-        assert_eq!(trouble.changed(1900 * MS, jumped), None);
-        assert_eq!(trouble.changed(2200 * MS, jumped), Some(jumped));
-        assert_eq!([2300, 2600].map(|ms| trouble.changed(ms * MS, well)), [None, Some(well)]);
+        assert_eq!(problem.changed(1000 * MS, silent), None);
+        assert_eq!(problem.changed(1027 * MS, well), None);
+        assert_eq!(problem.changed(1400 * MS, silent), None);
+        assert_eq!(problem.changed(1690 * MS, silent), None);
+        assert_eq!(problem.changed(1700 * MS, silent), Some(silent));
+        assert_eq!(problem.changed(1800 * MS, silent), None, "once");
+        assert_eq!(problem.changed(1900 * MS, jumped), None);
+        assert_eq!(problem.changed(2200 * MS, jumped), Some(jumped));
+        assert_eq!([2300, 2600].map(|ms| problem.changed(ms * MS, well)), [None, Some(well)]);
+    }
+
+    #[test]
+    fn points_go_scan_by_scan() {
+        let point = |beam| Point { beam, ..Point::default() };
+        let points = [3, 4, 7, 1, 2, 2, 0, 1, 2].map(point);
+        let lengths = |most| scans(&points, most).map(<[Point]>::len).collect::<Vec<_>>();
+        assert_eq!(lengths(401), [3, 2, 1, 3]);
+        assert_eq!(lengths(2), [2, 1, 2, 1, 2, 1]);
+        assert_eq!(scans(&[], 9).count(), 0);
+    }
+
+    #[test]
+    fn places_and_boxes_are_read_and_what_is_none_is_refused() {
+        assert_eq!(numbers("0.1, -2,3"), Ok([0.1, -2.0, 3.0]));
+        assert_eq!(numbers::<3>("1,2").unwrap_err(), "expected 3 numbers, found 2");
+        assert_eq!(numbers::<1>("inf").unwrap_err(), "\"inf\" is not a number");
+        assert!(axis("0,0,0").unwrap_err().contains("must not be 0,0,0"));
+        assert_eq!(cuboid("0,1,-1,1,0.1,2"), Ok([[0.0, 1.0], [-1.0, 1.0], [0.1, 2.0]]));
+        assert!(cuboid("1,0,-1,1,0.1,2").unwrap_err().contains("less"));
     }
 }

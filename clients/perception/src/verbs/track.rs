@@ -1,94 +1,105 @@
-//! `scanhub track`: people across the sensors of a site, as lines and as topics. Refuses to know how they are found.
+//! `scanhub track`: tracks people with the sensors of a site, and prints and publishes tracks and events.
 
-mod late;
-mod lines;
-mod publish;
-
-use std::io::Write;
-use std::rc::Rc;
+use std::io::{self, Write};
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use crate::track::{Kind as EventKind, Misplaced, People, Picture, Site};
-use late::LateReports;
-use publish::Samples;
-use scanhub_client::streams::Sample;
-use scanhub_schema::{Failure, Foreground, Header, Kind, Scan, Topic};
+use clap::Args;
+use scanhub_client::clock;
+use scanhub_client::streams::{Join, Sample};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Event, Failure, Foreground, Header, Kind, Scan, Topic, Tracks, Wake};
 use scanhub_shm::Domain;
-
-use scanhub_verbs::follow::ReceiveStats;
-use scanhub_verbs::follow::{Bounds, Notice, Sink, follow};
+use scanhub_verbs::follow::{self, Bounds, Following};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::output::{End, Output, quiet};
-use scanhub_verbs::{json, text};
+use scanhub_verbs::output::{End, quiet};
+use scanhub_verbs::{duration, json, text};
+use serde::{Serialize, Serializer};
 
-/// What `track` is asked for.
-#[derive(Clone, Debug)]
-pub struct TrackOptions {
-    /// Sensors, rooms and doors.
-    pub site: Site,
-    /// The name that its topics are published under; none: it publishes nothing.
-    pub name: Option<String>,
-    /// Only the counts of these doors are told; none: everything.
-    pub count: Vec<String>,
-    /// How long a scan is waited for.
-    pub delay: Duration,
-    /// Lines of JSON.
-    pub json: bool,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+use super::own_name;
+use super::results::{Results, Topics};
+use crate::track::{self, Counts, Misplaced, PICTURE_NS, PeopleTracker, Picture, Site};
+
+/// Arguments of `track`.
+#[derive(Args, Clone, Debug)]
+pub struct TrackArgs {
+    /// The site file: sensors, rooms and doors
+    #[arg(long, value_name = "FILE")]
+    site: PathBuf,
+    /// Also publish the topics NAME/tracks and NAME/events. NAME must not be in use
+    #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
+    name: Option<String>,
+    /// Print only how many went through this door, each time that somebody does. Can be repeated
+    #[arg(long, value_name = "DOOR")]
+    count: Vec<String>,
+    /// How long to wait for a sensor's scan after other sensors have sent later ones
+    #[arg(long, default_value = "80ms", value_name = "DURATION", value_parser = duration::parse)]
+    delay: Duration,
+    /// Stop after this time, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// Exit with 3 after this time without a scan
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    timeout: Option<Duration>,
 }
 
-/// Follows people by scans and foregrounds of the site's sensors, and writes to `out` who is where, or what happens at doors;
-/// what is neither to `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached, `stop` is set, or nobody reads
-/// any more.
-///
-/// # Errors
-///
-/// [`Kind::Configuration`] if a door is not in the site, [`Kind::NoTopic`] with the sensors that there are,
-/// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
-/// `stop` came first; those of publishing if it has a name.
-pub fn track(
-    options: &TrackOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let doors = options.count.iter().map(|name| door(&options.site, name)).collect::<Result<Vec<_>, _>>()?;
-    let topics = [Topic::Scan, Topic::Foreground];
-    let names = options
-        .site
-        .sensors
-        .iter()
-        .flat_map(|sensor| topics.map(|topic| TopicName { sensor: sensor.name.clone(), topic }));
-    let names: Vec<TopicName> = names.collect();
-    let name = options.name.as_deref().unwrap_or(UNNAMED);
-    let delay_ns = u64::try_from(options.delay.as_nanos()).unwrap_or(u64::MAX);
-    let mut verb = Verb {
-        options,
-        people: People::new(options.site.clone(), delay_ns),
-        halves: names.iter().map(|_| Half::default()).collect(),
-        teller: Teller {
-            options,
-            name,
-            counted: doors,
-            passed: vec![[0; 2]; options.site.doors.len()],
-            appeared: 0,
-            samples: Samples::new(name),
-            out: Output::new(out),
-            notes: Output::new(notes),
-        },
-        missed: 0,
-        late: LateReports::new(options.site.sensors.len()),
-        is_there: false,
-        flags: 0,
-        summaries: names.len(),
-    };
-    quiet(follow(&names, &[], &options.places, &options.bounds, stop, &mut verb))
+impl TrackArgs {
+    /// Subscribes to the scans and foregrounds of the site's sensors in the first live domain of `places`. Writes tracks and
+    /// events to `out`, or only the counts of some doors. Without `json`, notices go to `notes` (stderr). Ends at the limits,
+    /// when `stop` is set, or when the reader of `out` has closed it.
+    ///
+    /// # Errors
+    ///
+    /// - The errors of [`Site::read`].
+    /// - [`Kind::Configuration`] if the site has no such door.
+    /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
+    /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
+    /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let site = Site::read(&self.site)?;
+        let counted = self.count.iter().map(|name| door(&site, name)).collect::<Result<_, _>>()?;
+        let topics = |sensor: &track::site::Sensor| {
+            [Topic::Scan, Topic::Foreground].map(|topic| TopicName { sensor: sensor.name.clone(), topic })
+        };
+        let names: Vec<TopicName> = site.sensors.iter().flat_map(topics).collect();
+        let bounds = Bounds { count: None, run_for: self.run_for, timeout: self.timeout };
+        let name = self.name.as_deref().unwrap_or(UNNAMED);
+        let mut results = Results::new(name, json, out, notes);
+        results.header.period_us = (PICTURE_NS / 1000) as u32;
+        let mut run = TrackRun {
+            args: self,
+            places,
+            tracker: PeopleTracker::new(
+                site.clone(),
+                u64::try_from(self.delay.as_nanos()).unwrap_or(u64::MAX),
+            ),
+            joins: site.sensors.iter().map(|_| Join::default()).collect(),
+            late: LateReports::new(site.sensors.len()),
+            is_subscribed: false,
+            writer: PictureWriter {
+                counted,
+                passed: vec![[0; 2]; site.doors.len()],
+                appeared: 0,
+                tracks: Box::default(),
+                samples: [0; 2],
+                site,
+                results,
+            },
+        };
+        quiet(run.follow(&mut Following::new(&names, &[], places, &bounds, stop)))
+    }
 }
 
+/// Returns the index of a door.
 fn door(site: &Site, name: &str) -> Result<usize, Failure> {
     site.doors.iter().position(|door| door.name == name).ok_or_else(|| {
         let known: Vec<&str> = site.doors.iter().map(|door| door.name.as_str()).collect();
@@ -100,194 +111,343 @@ fn door(site: &Site, name: &str) -> Result<usize, Failure> {
     })
 }
 
-/// Scans of a sensor whose foregrounds have not come, and the other way round: the two come one after the other.
-#[derive(Default)]
-struct Half {
-    scans: Vec<(Header, Box<Scan>)>,
-    foregrounds: Vec<(Header, Box<Foreground>)>,
-}
-
-/// Whether both were made of the same telegram.
-fn is_same(one: &Header, other: &Header) -> bool {
-    (one.boot, one.seq) == (other.boot, other.seq)
-}
-
-/// What lines call a tracker that publishes nothing.
+/// Name in the lines of a tracker that publishes nothing.
 const UNNAMED: &str = "people";
-/// So many wait for their other half.
-const WAITING: usize = 32;
 
-struct Verb<'a> {
-    options: &'a TrackOptions,
-    people: People,
-    /// By the number of the sensor in the site.
-    halves: Vec<Half>,
-    teller: Teller<'a>,
-    missed: u64,
+type ScanJoin = Join<(Header, Box<Scan>), Box<Foreground>>;
+
+struct TrackRun<'a> {
+    args: &'a TrackArgs,
+    places: &'a [Domain],
+    tracker: PeopleTracker,
+    /// Scans and foregrounds of each sensor of the site.
+    joins: Vec<ScanJoin>,
     late: LateReports,
-    /// A topic of a sensor was there.
-    is_there: bool,
-    /// Flags of the last scan.
-    flags: u8,
-    /// Topics that are not yet over.
-    summaries: usize,
+    /// Whether a topic of a sensor has existed.
+    is_subscribed: bool,
+    writer: PictureWriter<'a>,
 }
 
-impl Sink for Verb<'_> {
-    fn subscribed(&mut self, _: &TopicName) {
-        self.is_there = true;
+impl TrackRun<'_> {
+    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        let end = self.take_events(following);
+        if !matches!(end, Err(End::ReaderGone)) {
+            self.sum_up()?;
+        }
+        end
     }
 
-    /// Reports late scans, and publishes from the moment that there is a domain.
-    fn tick(&mut self, now: Instant) -> Result<(), End> {
-        for (sensor, count) in self.late.due(now, self.people.late()) {
-            self.teller.report_late(sensor, count)?;
-        }
-        let samples = &mut self.teller.samples;
-        match &self.options.name {
-            Some(name) if self.is_there && !samples.is_published() => {
-                Ok(samples.publish(name, &self.options.places)?)
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        let Some(sensor) = self.options.site.sensors.iter().position(|one| one.name == name.sensor) else {
-            return Ok(());
-        };
-        let half = &mut self.halves[sensor];
-        let of = match sample {
-            Sample::Scan(scan) => {
-                half.scans.push((*scan.header(), scan.boxed()));
-                *scan.header()
-            }
-            Sample::Foreground(foreground) => {
-                half.foregrounds.push((*foreground.header(), foreground.boxed()));
-                *foreground.header()
-            }
-            _ => return Ok(()),
-        };
-        let scan = half.scans.iter().position(|(header, _)| is_same(header, &of));
-        let foreground = half.foregrounds.iter().position(|(header, _)| is_same(header, &of));
-        let (Some(scan), Some(foreground)) = (scan, foreground) else {
-            half.scans.drain(..half.scans.len().saturating_sub(WAITING));
-            half.foregrounds.drain(..half.foregrounds.len().saturating_sub(WAITING));
-            return Ok(());
-        };
-        let (Header { wall_ns, flags, .. }, scan) = half.scans.swap_remove(scan);
-        let (_, foreground) = half.foregrounds.swap_remove(foreground);
-        let mut told = Ok(());
-        let teller = &mut self.teller;
-        self.flags = flags;
-        self.people.take(sensor, wall_ns, &scan, &foreground, |picture| {
-            if told.is_ok() {
-                told = teller.tell(picture, flags);
-            }
-        });
-        told
-    }
-
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
-        if let Notice::Missed(count) = notice {
-            self.missed += count;
-        }
-        notice.tell(names, self.options.json, &mut self.teller.out, &mut self.teller.notes)
-    }
-
-    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
-        self.summaries -= 1;
-        if self.summaries > 0 {
-            return Ok(());
-        }
-        let mut told = Ok(());
-        let (teller, flags) = (&mut self.teller, self.flags);
-        self.people.finish(|picture| {
-            if told.is_ok() {
-                told = teller.tell(picture, flags);
-            }
-        });
-        told?;
-        for (sensor, count) in self.late.unreported(self.people.late()) {
-            teller.report_late(sensor, count)?;
-        }
-        teller.sum_up(&self.people, self.missed)
-    }
-}
-
-/// What writes the lines.
-struct Teller<'a> {
-    options: &'a TrackOptions,
-    /// What lines call the tracker.
-    name: &'a str,
-    /// Numbers of the doors whose counts alone are told; none: everything.
-    counted: Vec<usize>,
-    /// Who went through each door: from its `from` to its `to`, and back.
-    passed: Vec<[u64; 2]>,
-    appeared: u64,
-    samples: Samples,
-    out: Output<'a>,
-    notes: Output<'a>,
-}
-
-impl Teller<'_> {
-    fn tell(&mut self, picture: &Picture, flags: u8) -> Result<(), End> {
-        let Teller { options, name, counted, passed, appeared, samples, out, notes } = self;
-        let TrackOptions { site, json: is_json, .. } = options;
-        samples.take(picture, site, flags);
-        let tells_all = counted.is_empty();
-        if tells_all && *is_json {
-            let (header, tracks) = samples.tracks();
-            out.json(&json::tracks(name, header, tracks))?;
-        }
-        for &Misplaced { sensor, other, off } in &picture.misplaced {
-            let [sensor, other] = [sensor, other].map(|number| site.sensors[number].name.as_str());
-            match is_json {
-                true => out.json(&lines::misplaced(name, picture.wall_ns, sensor, other, off))?,
-                false => notes.line(|line| lines::misplaced_text(line, sensor, other, off))?,
-            }
-        }
-        for (event, (header, payload)) in picture.events.iter().zip(samples.events()) {
-            match (tells_all, is_json) {
-                (true, true) => out.json(&json::event(name, header, payload))?,
-                (true, false) => out.line(|line| text::event_words(line, payload))?,
-                (false, _) => {}
-            }
-            *appeared += u64::from(event.kind == EventKind::Appeared);
-            let EventKind::Door { door, from, .. } = event.kind else { continue };
-            passed[door][usize::from(site.doors[door].from != from)] += 1;
-            if counted.contains(&door) {
-                let (door, passed) = (&site.doors[door].name, passed[door]);
-                match is_json {
-                    true => out.json(&lines::count(name, door, passed, event.wall_ns))?,
-                    false => out.line(|line| lines::count_text(line, door, passed))?,
-                }
+    fn take_events(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        while let Some(event) = following.next(None)? {
+            match event {
+                follow::Event::Subscribed(_) => self.is_subscribed = true,
+                follow::Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
+                follow::Event::Notice(names, notice) => self.writer.results.notice(&names, &notice)?,
+                follow::Event::Tick(now) => self.tick(now)?,
+                _ => {}
             }
         }
         Ok(())
     }
 
-    /// Reports `count` late scans of `sensor`.
-    fn report_late(&mut self, sensor: usize, count: u64) -> Result<(), End> {
-        let (name, delay) = (&self.options.site.sensors[sensor].name, self.options.delay);
-        match self.options.json {
-            true => {
-                let wall_ns = self.samples.tracks().0.wall_ns;
-                self.out.json(&lines::late(self.name, wall_ns, name, count, delay))
-            }
-            false => self.notes.line(|line| lines::late_text(line, name, count, delay)),
+    /// Reports late scans, and publishes as soon as a domain exists.
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        let now_ns = clock::now_ns();
+        self.joins.iter_mut().for_each(|join| join.expire(now_ns));
+        for (sensor, count) in self.late.due(now, self.tracker.late()) {
+            self.writer.report_late(sensor, count, self.args.delay)?;
         }
+        let results = &mut self.writer.results;
+        if self.args.name.is_some() && self.is_subscribed && results.topics.is_none() {
+            results.publish(TopicLimits::default(), self.places)?;
+        }
+        Ok(())
     }
 
-    fn sum_up(&mut self, people: &People, missed: u64) -> Result<(), End> {
-        let site = &self.options.site;
-        let doors = site.doors.iter().zip(&self.passed).map(|(door, passed)| (door.name.as_str(), *passed));
-        let doors: Vec<_> = doors.collect();
-        let (pictures, failed) = (self.samples.pictures(), self.samples.failed());
-        let sum = lines::Sum { pictures, appeared: self.appeared, counts: people.counts(), missed, failed };
-        if self.options.json {
-            return self.out.json(&lines::summary(self.name, &sum, &doors));
+    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        let sensors = &self.tracker.site().sensors;
+        let Some(sensor) = sensors.iter().position(|one| one.name == name.sensor) else { return Ok(()) };
+        let (join, now_ns) = (&mut self.joins[sensor], clock::now_ns());
+        let pair = match sample {
+            Sample::Scan(scan) => join.first(scan.header(), (*scan.header(), scan.boxed()), now_ns),
+            Sample::Foreground(found) => join.second(found.header(), found.boxed(), now_ns),
+            _ => None,
+        };
+        let Some(((header, scan), foreground)) = pair else { return Ok(()) };
+        self.writer.results.take_flags(&header);
+        let mut written = Ok(());
+        self.tracker.take(sensor, header.wall_ns, &scan, &foreground, |picture| {
+            if written.is_ok() {
+                written = self.writer.write(picture);
+            }
+        });
+        written
+    }
+
+    fn sum_up(&mut self) -> Result<(), End> {
+        let writer = &mut self.writer;
+        let mut written = Ok(());
+        self.tracker.finish(|picture| {
+            if written.is_ok() {
+                written = writer.write(picture);
+            }
+        });
+        written?;
+        for (sensor, count) in self.late.unreported(self.tracker.late()) {
+            writer.report_late(sensor, count, self.args.delay)?;
         }
-        self.out.line(|line| lines::summary_text(line, &sum, &doors))
+        writer.sum_up(self.tracker.counts())
+    }
+}
+
+/// Writes and publishes pictures.
+struct PictureWriter<'a> {
+    site: Site,
+    /// Indices of the doors whose counts alone are printed; empty: everything is.
+    counted: Vec<usize>,
+    /// Number of people who went through each door: from its `from` to its `to`, and back.
+    passed: Vec<[u64; 2]>,
+    appeared: u64,
+    /// Tracks of the last picture.
+    tracks: Box<Tracks>,
+    /// Number of samples of `tracks` and of `events`.
+    samples: [u64; 2],
+    results: Results<'a, Tracks, Event>,
+}
+
+impl PictureWriter<'_> {
+    fn write(&mut self, picture: &Picture) -> Result<(), End> {
+        let events = self.publish(picture);
+        let PictureWriter { site, counted, passed, appeared, tracks, results, .. } = self;
+        let (name, prints_all) = (results.name, counted.is_empty());
+        if prints_all && results.is_json {
+            let header = results.header;
+            results.result(&json::tracks(name, &header, tracks), |_| Ok(()))?;
+        }
+        for &Misplaced { sensor, other, off: [dx_m, dy_m] } in &picture.misplaced {
+            let [sensor, other] = [sensor, other].map(|number| site.sensors[number].name.as_str());
+            let line =
+                Line::Misplaced { sensor: name, wall_ns: picture.wall_ns, name: sensor, other, dx_m, dy_m };
+            results.note(&line, |out| line.text(out))?;
+        }
+        for (event, (header, payload)) in picture.events.iter().zip(&events) {
+            if prints_all {
+                results.result(&json::event(name, header, payload), |out| text::event_words(out, payload))?;
+            }
+            *appeared += u64::from(event.kind == track::Kind::Appeared);
+            let track::Kind::Door { door, from, .. } = event.kind else { continue };
+            passed[door][usize::from(site.doors[door].from != from)] += 1;
+            if counted.contains(&door) {
+                let door = Passed::of(&site.doors[door].name, passed[door]);
+                let line = Line::Count { sensor: name, wall_ns: event.wall_ns, door };
+                results.result(&line, |out| line.text(out))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Publishes a picture if the tracker has topics. Returns its events as samples.
+    fn publish(&mut self, picture: &Picture) -> Vec<(Header, Event)> {
+        let PictureWriter { site, tracks, samples: [pictures, events], results, .. } = self;
+        let now_ns = clock::now_ns();
+        let header = Header {
+            seq: *pictures,
+            topic_seq: *pictures,
+            stamp_first_ns: now_ns,
+            stamp_last_ns: now_ns,
+            wall_ns: picture.wall_ns,
+            ..results.header
+        };
+        results.header = header;
+        **tracks = picture.payload(site);
+        let numbered = picture.events.iter().zip(*events..).map(|(event, topic_seq)| {
+            (Header { topic_seq, wall_ns: event.wall_ns, ..header }, event.payload(site))
+        });
+        let numbered: Vec<_> = numbered.collect();
+        *pictures += 1;
+        *events += numbered.len() as u64;
+        if let Some(Topics { publications, sensor }) = &mut results.topics {
+            // Subscribers notice by its number that a sample is missing, and poll if they cannot be woken.
+            for (header, event) in &numbered {
+                let _ = publications.1.send_with(header, |sample| *sample = *event);
+            }
+            let _ = publications.0.send_with(&header, |sample| *sample = **tracks);
+            let _ = sensor.wake(Wake::Telegram);
+        }
+        numbered
+    }
+
+    /// Reports `late` late scans of a sensor.
+    fn report_late(&mut self, sensor: usize, late: u64, delay: Duration) -> Result<(), End> {
+        let (sensor, name) = (self.results.name, &self.site.sensors[sensor].name);
+        let line = Line::Late { sensor, wall_ns: self.results.header.wall_ns, name, late, delay };
+        self.results.note(&line, |out| line.text(out))
+    }
+
+    fn sum_up(&mut self, counts: Counts) -> Result<(), End> {
+        let doors = self.site.doors.iter().zip(&self.passed);
+        let line = Line::Summary {
+            sensor: self.results.name,
+            pictures: self.samples[0],
+            appeared: self.appeared,
+            doors: doors.map(|(door, &passed)| Passed::of(&door.name, passed)).collect(),
+            counts,
+            missed: self.results.missed,
+            failed: self.results.failed(),
+        };
+        self.results.result(&line, |out| line.text(out))
+    }
+}
+
+/// The lines that only `track` has. The variant is the class.
+#[derive(Serialize)]
+#[serde(tag = "class", rename_all = "snake_case")]
+enum Line<'a> {
+    Count {
+        sensor: &'a str,
+        wall_ns: u64,
+        #[serde(flatten)]
+        door: Passed<'a>,
+    },
+    Misplaced {
+        sensor: &'a str,
+        wall_ns: u64,
+        name: &'a str,
+        other: &'a str,
+        #[serde(serialize_with = "hundredths")]
+        dx_m: f64,
+        #[serde(serialize_with = "hundredths")]
+        dy_m: f64,
+    },
+    Late {
+        sensor: &'a str,
+        wall_ns: u64,
+        name: &'a str,
+        late: u64,
+        #[serde(rename = "delay_ms", serialize_with = "milliseconds")]
+        delay: Duration,
+    },
+    Summary {
+        sensor: &'a str,
+        pictures: u64,
+        appeared: u64,
+        doors: Vec<Passed<'a>>,
+        #[serde(flatten)]
+        counts: Counts,
+        missed: u64,
+        /// Samples that were not published because memory was short.
+        failed: u64,
+    },
+}
+
+/// Number of people who went through a door: from its `from` to its `to`, and back.
+#[derive(Clone, Copy, Serialize)]
+struct Passed<'a> {
+    door: &'a str,
+    forth: u64,
+    back: u64,
+}
+
+impl<'a> Passed<'a> {
+    fn of(door: &'a str, [forth, back]: [u64; 2]) -> Passed<'a> {
+        Passed { door, forth, back }
+    }
+
+    fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
+        write!(out, "{}: {} forth, {} back", self.door, self.forth, self.back)
+    }
+}
+
+impl Line<'_> {
+    fn text(&self, out: &mut Vec<u8>) -> io::Result<()> {
+        match self {
+            Line::Count { door, .. } => door.text(out),
+            Line::Misplaced { name, other, dx_m, dy_m, .. } => write!(
+                out,
+                "{name} sees people ({dx_m:.2}, {dy_m:.2}) m beside where {other} sees them: correct one of their poses \
+                 in the site file; until then {name} is taken to be where {other} says"
+            ),
+            Line::Late { name, late, delay, .. } => {
+                match late {
+                    1 => write!(out, "{name}: 1 scan was dropped because it arrived late")?,
+                    _ => write!(out, "{name}: {late} scans were dropped because they arrived late")?,
+                }
+                write!(out, ": set --delay longer than {delay:?}")
+            }
+            Line::Summary { appeared, doors, counts, missed, failed, .. } => {
+                let Counts { scans, late, jumped, unfit } = counts;
+                write!(out, "{appeared} people appeared in {scans} scans")?;
+                for door in doors {
+                    write!(out, "; ")?;
+                    door.text(out)?;
+                }
+                write!(out, "; left out: {late} late, {jumped} jumped, {unfit} unfit, {missed} missed")?;
+                if *failed > 0 { write!(out, "; {failed} not published: no memory") } else { Ok(()) }
+            }
+        }
+    }
+}
+
+fn hundredths<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64((100.0 * value).round() / 100.0)
+}
+
+fn milliseconds<S: Serializer>(value: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_u64(u64::try_from(value.as_millis()).unwrap_or(u64::MAX))
+}
+
+/// Minimum time between two reports of late scans. The first one is due at once.
+const LATE_REPORT_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Limits how often late scans are reported.
+struct LateReports {
+    /// Late scans of each sensor that were reported.
+    reported: Vec<u64>,
+    /// Earliest time of the next report.
+    next: Option<Instant>,
+}
+
+impl LateReports {
+    fn new(sensors: usize) -> LateReports {
+        LateReports { reported: vec![0; sensors], next: None }
+    }
+
+    /// Returns the sensors that have late scans, with their number since the last report, if a report is due. `late` has the
+    /// late scans of each sensor since the start.
+    fn due(&mut self, now: Instant, late: &[u64]) -> Vec<(usize, u64)> {
+        if late == self.reported || self.next.is_some_and(|next| now < next) {
+            return Vec::new();
+        }
+        self.next = Some(now + LATE_REPORT_INTERVAL);
+        self.unreported(late)
+    }
+
+    /// Returns what the last report does not contain, even if no report is due: for the end of a run.
+    fn unreported(&mut self, late: &[u64]) -> Vec<(usize, u64)> {
+        let since = late.iter().zip(&self.reported).map(|(late, reported)| late - reported).enumerate();
+        let since = since.filter(|&(_, count)| count > 0).collect();
+        self.reported.copy_from_slice(late);
+        since
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn first_late_scan_is_reported_at_once_and_others_every_five_seconds() {
+        let begin = Instant::now();
+        let mut reports = LateReports::new(3);
+        let mut due = |after_s: u64, late: [u64; 3]| reports.due(begin + Duration::from_secs(after_s), &late);
+        assert_eq!(due(0, [0, 0, 0]), []);
+        assert_eq!(due(1, [0, 1, 0]), [(1, 1)]);
+        assert_eq!(due(5, [0, 40, 2]), []);
+        assert_eq!(due(6, [0, 41, 2]), [(1, 40), (2, 2)]);
+        assert_eq!(due(60, [0, 41, 2]), []);
+        assert_eq!(due(61, [0, 42, 2]), [(1, 1)]);
+        assert_eq!(due(62, [7, 42, 2]), []);
+        assert_eq!(reports.unreported(&[7, 42, 3]), [(0, 7), (2, 1)]);
+        assert_eq!(reports.unreported(&[7, 42, 3]), []);
     }
 }

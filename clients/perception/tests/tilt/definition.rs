@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use scanhub_perception::tilt::{Angle, Mount, Settings, Tilting};
+use scanhub_perception::tilt::{Angle, Mount, Settings, TiltScanner};
 use scanhub_schema::{Scan, ScanHead};
 
 const MS: u64 = 1_000_000;
@@ -73,7 +73,7 @@ fn each_point_is_where_all_angles_together_say() {
                 expected.insert((at, beam as u16), point(&mount, angle, scan.angle(beam), range_m));
             }
         }
-        let mut tilting = Tilting::new(mount, Settings::default());
+        let mut tilting = TiltScanner::new(mount, Settings::default());
         let mut made = 0;
         let mut check = |sweep: &scanhub_perception::tilt::Sweep<'_>| {
             for point in sweep.points {

@@ -5,7 +5,7 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use scanhub_perception::track::geometry::{Point, distance};
-use scanhub_perception::track::{Event, People, Picture, Site};
+use scanhub_perception::track::{Event, PeopleTracker, Picture, Site};
 use scanhub_preprocess::background::{Model, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Foreground, Pose, Scan, ScanHead};
@@ -214,7 +214,7 @@ pub(crate) fn run(scene: &Scene<'_>, mut show: impl FnMut(&Picture)) {
     let mut foreground = Foreground::of(beams);
     let pose = format!("x = {:.2}, y = {:.2}", at[0], at[1]);
     let site = scene.site.replace("x = 0.0, y = 0.0", &pose);
-    let mut people = People::new(Site::parse("hall.toml", &site).expect("a hall"), 0);
+    let mut people = PeopleTracker::new(Site::parse("hall.toml", &site).expect("a hall"), 0);
     let mut words = vec![0; beams];
     let (mut open, mut until_s, mut next_s) = (0.0_f64, 0.0, EVERY_S);
     for scan in 0..scene.seconds * scanner.hz {

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 use flate2::read::GzDecoder;
 use scanhub_perception::track::geometry::{Point, distance};
-use scanhub_perception::track::{People, Picture, Site};
+use scanhub_perception::track::{PeopleTracker, Picture, Site};
 use scanhub_preprocess::background::{Model, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::{Background, BackgroundHead, Code, Foreground, Pose, Scan, ScanHead, TrackState};
@@ -95,7 +95,7 @@ fn background<'a>(walks: impl Iterator<Item = &'a Vec<Line>>) -> Box<Background>
 
 /// How many labels of a walk a track covers, of a hub that begins with `background`.
 fn covered(walk: &[Line], background: Option<&Background>) -> usize {
-    let mut people = People::new(Site::parse("room.toml", ROOM).expect("a room"), 0);
+    let mut people = PeopleTracker::new(Site::parse("room.toml", ROOM).expect("a room"), 0);
     let (mut model, mut segmenter) = (
         Model::new(Settings { scans: Some(SCANS), ..Settings::default() }, BEAMS),
         Segmenter::new(Pose::default(), BEAMS),

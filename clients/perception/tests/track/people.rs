@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use crate::house::{BEAMS, CHAIRS, Eye, House};
 use crate::walkers::Crowd;
 use scanhub_perception::track::geometry::distance;
-use scanhub_perception::track::{People, Picture, Site};
+use scanhub_perception::track::{PeopleTracker, Picture, Site};
 use scanhub_preprocess::background::{Model, Settings};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_schema::TrackState;
@@ -66,12 +66,12 @@ fn sent_of(
     all
 }
 
-fn pictures<'a>(sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, People) {
+fn pictures<'a>(sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, PeopleTracker) {
     pictures_of(site(), sent)
 }
 
-fn pictures_of<'a>(site: Site, sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, People) {
-    let mut people = People::new(site, DELAY_NS);
+fn pictures_of<'a>(site: Site, sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, PeopleTracker) {
+    let mut people = PeopleTracker::new(site, DELAY_NS);
     let mut pictures = Vec::new();
     for Sent { sensor, wall_ns, scan, foreground } in sent {
         people.take(*sensor, *wall_ns, scan, foreground, |picture| pictures.push(picture.clone()));
@@ -97,7 +97,7 @@ fn the_same_scans_give_the_same_tracks_however_they_come() {
 fn latecomers_and_clocks_that_jump_are_counted_and_change_nothing() {
     let sent = sent(2, 20);
     let (in_order, _) = pictures(sent.iter());
-    let mut people = People::new(site(), DELAY_NS);
+    let mut people = PeopleTracker::new(site(), DELAY_NS);
     let mut shown = Vec::new();
     for (number, Sent { sensor, wall_ns, scan, foreground }) in sent.iter().enumerate() {
         let mut take = |wall_ns| {

@@ -1,18 +1,117 @@
-//! The plan as SVG, for `scanhub site check`. Refuses to know whether it is right.
+//! `scanhub site`: checks a site file, and draws its plan.
 
-use std::fmt::Write;
+use std::fmt::Write as _;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
-use scanhub_schema::Printable;
+use clap::{Args, Subcommand};
+use scanhub_files::{output, regular};
+use scanhub_schema::{Failure, Kind, Printable};
+use scanhub_verbs::output::{End, Output, quiet};
+use serde::Serialize;
 
-use super::Site;
+use crate::track::Site;
 use crate::track::geometry::{Point, middle};
 
-/// Pixels per metre.
+/// Arguments of `site`.
+#[derive(Args, Clone, Debug)]
+pub struct SiteArgs {
+    #[command(subcommand)]
+    command: SiteCommand,
+}
+
+#[derive(Clone, Debug, Subcommand)]
+enum SiteCommand {
+    /// Check a site file; if it has an error, show the place and exit with 78
+    Check {
+        /// The site file: sensors, rooms and doors
+        file: PathBuf,
+        /// Draw the plan into this file
+        #[arg(long, value_name = "OUT")]
+        svg: Option<PathBuf>,
+        /// Replace an existing file of --svg
+        #[arg(long, requires = "svg")]
+        force: bool,
+    },
+}
+
+/// Contents of a site file, as a line of JSON.
+#[derive(Serialize)]
+struct Plan<'a> {
+    class: &'static str,
+    sensors: Vec<&'a str>,
+    rooms: Vec<&'a str>,
+    /// Rooms without a sensor.
+    unwatched: Vec<&'a str>,
+    doors: Vec<&'a str>,
+    gaps: usize,
+    ignored: Vec<&'a str>,
+}
+
+impl SiteArgs {
+    /// Checks a site file, and writes its contents to `out`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Site::read`], and [`Kind::Failed`] if a file or the output cannot be written.
+    pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+        let SiteCommand::Check { file, svg, force } = &self.command;
+        let site = Site::read(file)?;
+        if let Some(svg) = svg {
+            output::write(svg, site.svg().as_bytes(), *force)?;
+        }
+        let watched = site.watched();
+        let unwatched = site.rooms.iter().zip(&watched).filter(|(_, is_watched)| !**is_watched);
+        let plan = Plan {
+            class: "site",
+            sensors: site.sensors.iter().map(|sensor| sensor.name.as_str()).collect(),
+            rooms: site.rooms.iter().map(|room| room.name.as_str()).collect(),
+            unwatched: unwatched.map(|(room, _)| room.name.as_str()).collect(),
+            doors: site.doors.iter().map(|door| door.name.as_str()).collect(),
+            gaps: site.gaps.len(),
+            ignored: site.ignored.iter().map(|area| area.name.as_str()).collect(),
+        };
+        let mut out = Output::new(out);
+        quiet(if json { out.json(&plan) } else { plan.write(&mut out) })
+    }
+}
+
+impl Plan<'_> {
+    fn write(&self, out: &mut Output<'_>) -> Result<(), End> {
+        let doors = if self.doors.is_empty() { "none".to_owned() } else { self.doors.join(", ") };
+        out.line(|line| write!(line, "sensors: {}", self.sensors.join(", ")))?;
+        out.line(|line| write!(line, "rooms: {}", self.rooms.join(", ")))?;
+        out.line(|line| write!(line, "doors: {doors}"))?;
+        out.line(|line| write!(line, "gaps: {}", self.gaps))?;
+        if !self.ignored.is_empty() {
+            out.line(|line| write!(line, "ignored areas: {}", self.ignored.join(", ")))?;
+        }
+        if !self.unwatched.is_empty() {
+            out.line(|line| write!(line, "no sensor is in: {}", self.unwatched.join(", ")))?;
+        }
+        Ok(())
+    }
+}
+
+/// Pixels per meter.
 const SCALE: f64 = 60.0;
-/// Metres around the plan.
+/// Margin around the plan, in meters.
 const MARGIN_M: f64 = 0.8;
 
 impl Site {
+    /// Reads the site file at `path`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the file cannot be read, and the errors of [`Site::parse`].
+    pub fn read(path: &Path) -> Result<Site, Failure> {
+        let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+            let message = format!("{}: {error}", path.display());
+            Failure::new(Kind::Input, message, "name a readable site file; docs/tracks.md has one")
+        })?;
+        Site::parse(&path.display().to_string(), &text)
+    }
+
     /// Returns a drawing: rooms with their names, ignored areas, doors, gaps, and sensors with the way that they look. One
     /// meter is 60 pixels; y is up.
     pub fn svg(&self) -> String {
@@ -29,14 +128,14 @@ impl Site {
              font-family=\"sans-serif\" font-size=\"13\">\n\
              <rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n"
         );
-        let text = |svg: &mut String, point: Point, down: f64, colour: &str, words: &str| {
+        let text = |svg: &mut String, point: Point, down: f64, color: &str, words: &str| {
             let (x, y) = at(point);
             // XML has no control characters, not even escaped ones.
             let words = Printable(words).to_string().replace(['\n', '\u{FFFE}', '\u{FFFF}'], "?");
             let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
             let _ = writeln!(
                 svg,
-                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{colour}\">{words}</text>",
+                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{color}\">{words}</text>",
                 y + down
             );
         };

@@ -1,18 +1,18 @@
-//! One scan as a sensor of the site sees it: how far it looks in each direction, the legs in it, and whether a place is seen,
-//! hidden or seen through. Refuses to know whose legs they are.
+//! One scan as a sensor of the site sees it: its range in each direction, the legs in it, and whether a position is occupied,
+//! free or occluded.
 
 use std::f64::consts::{FRAC_PI_4, TAU};
 
 use scanhub_schema::{Foreground, Scan};
 
-use crate::track::geometry::{Point, distance, minus};
-use crate::track::site::{Sensor, Site};
+use super::geometry::{Point, distance, minus};
+use super::site::{Sensor, Site};
 
-/// The most legs of a scan.
+/// Maximum number of legs in a scan.
 pub const LEGS: usize = 64;
-/// Radius of a leg with its trousers, in metres.
+/// Radius of a leg with its trousers, in meters.
 pub(crate) const LEG_M: f64 = 0.06;
-/// What is wider is two legs beside each other.
+/// Maximum width of a leg. A wider object is two legs next to each other.
 const WIDEST_LEG_M: f64 = 0.26;
 /// Minimum width of a leg with its trousers. The legs of chairs and tables are thinner.
 const THINNEST_LEG_M: f64 = 0.09;
@@ -29,23 +29,24 @@ const FREE_M: f64 = 0.6;
 /// Points between the jambs at which a door is checked, and the distance from the line that a closed leaf may have.
 const CLOSED_POINTS: usize = 9;
 const CLOSED_M: f64 = 0.25;
-/// What is wider is no person.
+/// Maximum width of a person.
 const WIDEST_M: f64 = 1.3;
-/// By so much a beam has to end before the farthest that it ever reached, to have met something that stands there.
+/// Minimum distance of an object from the farthest point that its beam has reached.
 const BEFORE_M: f64 = 0.15;
-/// So many scans in a row have to reach farther than any before.
+/// Number of scans in a row that must reach farther than all before.
 const SCANS_FARTHER: u8 = 5;
-/// So far around a place are the legs of somebody who stands there.
+/// Maximum distance of the legs of a person from their position.
 const REACH_M: f64 = 0.35;
 
 /// A leg that one sensor sees.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Leg {
-    /// Its middle: a sensor sees the near side, which is corrected.
+    /// Middle of the leg. A sensor sees the near side, which is corrected.
     pub(crate) at: Point,
     /// Standard deviation of each coordinate.
     pub(crate) sigma_m: f64,
-    /// It stands in front of the background, and is no single beam. What the background has learned is not.
+    /// Whether it stands in front of the background, and is not a single beam. An object that the background has
+    /// learned is not fresh.
     pub(crate) is_fresh: bool,
     /// Whether it is evidence for a person. A leg of a chair is too thin, and a value between two surfaces is nothing at
     /// all. Both only support a track that other legs have started.
@@ -66,48 +67,48 @@ pub(crate) enum AtDoor {
     /// No leaf reaches it.
     Clear,
     /// A leaf that swings about a jamb reaches it.
-    Swing,
+    ReversalDetector,
     /// Between the jambs of a door, on the line along which a leaf may slide.
     Line,
     /// On this line, at a jamb or outside the opening, where an open leaf ends.
     Jamb,
 }
 
-/// What a scan says of a place where somebody may stand.
+/// Visibility of a position where a person may stand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Seen {
-    /// Nobody can stand there.
+pub(crate) enum Visibility {
+    /// The sensor sees through the position, so no one stands there.
     Through,
     /// Something stands there.
     Here,
-    /// Something nearer hides it, or no beam points there.
+    /// A nearer object occludes it, or no beam points there.
     Hidden,
 }
 
-/// What one sensor sees, and has seen.
-pub(crate) struct Sight {
+/// View of one sensor, and the farthest ranges that it has measured.
+pub(crate) struct SensorView {
     sensor: Sensor,
     first_angle: f64,
     step: f64,
-    /// Where each beam points in the map.
+    /// Direction of each beam in the map.
     directions: Vec<Point>,
-    /// Metres; nan: no reading, infinite: nothing came back.
+    /// Ranges in meters. NaN: no reading. Infinite: no return.
     ranges: Vec<f64>,
-    /// The farthest that each beam ever reached for some scans: the empty room.
+    /// The farthest range that each beam has reached for some scans: the empty room.
     farthest: Vec<f64>,
-    /// For how many scans each beam has reached farther, and how far at least.
+    /// Number of scans for which each beam has reached farther, and the minimum range of these.
     farther: Vec<(u8, f64)>,
     is_foreground: Vec<bool>,
     legs: Vec<Leg>,
-    /// Beams that end at something that stands there.
+    /// Beams that end at an object.
     standing: Vec<usize>,
-    /// Beams of the cluster that is open, and where they end.
+    /// Beams of the open cluster, and their end points.
     points: Vec<(usize, Point)>,
 }
 
-impl Sight {
-    pub(crate) fn new(sensor: Sensor) -> Sight {
-        Sight {
+impl SensorView {
+    pub(crate) fn new(sensor: Sensor) -> SensorView {
+        SensorView {
             sensor,
             first_angle: 0.0,
             step: 0.0,
@@ -154,7 +155,7 @@ impl Sight {
         self.find_legs();
     }
 
-    /// All that it sees is off by so much: so is its place.
+    /// Corrects the sensor's position by the offset of everything that it sees.
     pub(crate) fn shift(&mut self, off: Point) {
         self.sensor.place = minus(self.sensor.place, off);
     }
@@ -192,9 +193,9 @@ impl Sight {
         &self.legs
     }
 
-    /// What the last scan says of `place`.
-    pub(crate) fn look(&self, place: Point) -> Seen {
-        let Some((middle, far)) = self.beam(place) else { return Seen::Hidden };
+    /// Returns the visibility of `place` in the last scan.
+    pub(crate) fn look(&self, place: Point) -> Visibility {
+        let Some((middle, far)) = self.beam(place) else { return Visibility::Hidden };
         // Half the width of a person's legs.
         let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
         let first = (middle - half).max(0.0) as usize;
@@ -206,12 +207,12 @@ impl Sight {
                 continue;
             }
             let is_here = range > far - REACH_M && range <= far + REACH_M && range < farthest - BEFORE_M;
-            // A person is not as thin as what stands there.
+            // A person is not as thin as this object.
             let is_through =
                 is_here || range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05);
             here_run = if is_here { here_run + 1 } else { 0 };
             if is_here && !is_thin(here_run, spacing) {
-                return Seen::Here;
+                return Visibility::Here;
             }
             if is_through {
                 through += 1;
@@ -224,7 +225,7 @@ impl Sight {
         }
         hidden += hidden_run;
         let all = through + hidden;
-        if all >= 2 && 5 * through >= 4 * all { Seen::Through } else { Seen::Hidden }
+        if all >= 2 && 5 * through >= 4 * all { Visibility::Through } else { Visibility::Hidden }
     }
 
     /// Returns the beam to `place`, as a fraction of beams, and the distance; `None` if no beam points there.
@@ -241,7 +242,7 @@ impl Sight {
         (middle < self.ranges.len() as f64).then_some((middle, far))
     }
 
-    /// Elements for which there is memory.
+    /// Returns the number of elements that memory is allocated for.
     #[cfg(test)]
     pub(crate) fn capacity(&self) -> usize {
         let of_beams = self.directions.capacity() + self.ranges.capacity() + self.farthest.capacity();
@@ -249,7 +250,7 @@ impl Sight {
         of_beams + flags + self.legs.capacity() + self.standing.capacity() + self.points.capacity()
     }
 
-    /// Makes the tables for scans such as `scan`.
+    /// Prepares the tables for scans with the shape of `scan`.
     fn fit(&mut self, scan: &Scan) {
         let (shape, count) = ((scan.first_angle, scan.step), scan.beams());
         if (self.first_angle, self.step) == shape && self.ranges.len() == count {
@@ -298,7 +299,7 @@ impl Sight {
         (self.points, self.standing) = (points, standing);
     }
 
-    /// Makes legs of neighbouring points.
+    /// Finds the legs in neighboring points.
     fn close(&mut self, points: &[(usize, Point)]) {
         let (Some(&(first, begin)), Some(&(last, end))) = (points.first(), points.last()) else { return };
         let width = distance(begin, end);
@@ -374,7 +375,7 @@ fn is_flat(points: &[(usize, Point)]) -> bool {
     across < FLATNESS_M * FLATNESS_M
 }
 
-/// A beam reaches `range`: single readings that are too far are noise.
+/// Takes a range of a beam. Single readings that are too far are noise.
 fn reach(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
     if range > *farthest {
         (*scans, *least) = (*scans + 1, least.min(range));

@@ -1,30 +1,29 @@
-//! Whether sensors are where the site file says, as the legs tell that two of them see at once: votes for how far what the
-//! one sees is off from what the other sees. Legs of different people vote for anything, those of one person for the same.
-//! Refuses to know who is who.
+//! Detects sensors that are not where the site file says. When two sensors see legs at the same time, each pair of legs votes
+//! for an offset between the sensors. Votes from different people scatter; votes from the same person agree.
 
-use crate::track::geometry::Point;
-use crate::track::picture::Misplaced;
-use crate::track::sight::Leg;
+use super::Misplaced;
+use super::geometry::Point;
+use super::sensor_view::Leg;
 
-/// Side of a cell of the votes, in metres.
+/// Side of a cell of the votes, in meters.
 const CELL_M: f64 = 0.1;
-/// Cells to each side of none off.
+/// Number of cells on each side of a zero offset.
 const REACH: usize = 10;
 const ACROSS: usize = 2 * REACH + 1;
-/// So many votes are judged.
+/// Number of votes that are evaluated.
 const ENOUGH: u32 = 2_000;
-/// What is less may be the two legs of one who walks from sensor to sensor.
+/// Minimum offset. A smaller one may be the two legs of a person who walks from sensor to sensor.
 const LEAST_M: f64 = 0.35;
-/// Share of the votes that have to agree, and how many times as many as say that nothing is off.
+/// Minimum share of the votes that agree, and their minimum ratio to the votes for no offset.
 const AGREE: f64 = 0.12;
 const TIMES: u32 = 3;
-/// A leg that is known less well has no vote.
+/// Maximum standard deviation of a leg that votes.
 const WORST_M: f64 = 0.065;
 
-/// The votes of all pairs of sensors.
-pub(crate) struct Poses {
+/// Votes of all pairs of sensors.
+pub(crate) struct PoseVotes {
     sensors: usize,
-    /// By the number of the later sensor of the site, and then of the earlier one; none before the first vote.
+    /// By the index of the later sensor in the site, and then of the earlier one. `None` before the first vote.
     pairs: Vec<Option<Box<Votes>>>,
 }
 
@@ -33,13 +32,13 @@ struct Votes {
     count: u32,
 }
 
-impl Poses {
-    pub(crate) fn new(sensors: usize) -> Poses {
-        Poses { sensors, pairs: (0..sensors * sensors).map(|_| None).collect() }
+impl PoseVotes {
+    pub(crate) fn new(sensors: usize) -> PoseVotes {
+        PoseVotes { sensors, pairs: (0..sensors * sensors).map(|_| None).collect() }
     }
 
-    /// Takes what two sensors see at the same time. Returns how far the later one of the site is off, if that is known now; then
-    /// its votes begin anew.
+    /// Takes the legs that two sensors see at the same time. Returns the offset of the later sensor in the site once
+    /// it is known. Its votes then restart.
     pub(crate) fn take(&mut self, one: (usize, &[Leg]), two: (usize, &[Leg])) -> Option<Misplaced> {
         let ((other, theirs), (sensor, own)) = if one.0 < two.0 { (one, two) } else { (two, one) };
         for leg in own.iter().filter(|leg| has_vote(leg)) {
@@ -80,7 +79,7 @@ impl Default for Votes {
 }
 
 impl Votes {
-    /// How far off most say that the sensor is; nothing if they say that it is not, or do not agree.
+    /// Returns the offset that most votes are for. `None` if they are for no offset, or do not agree.
     fn off(&self) -> Option<Point> {
         let inner = || (1..ACROSS - 1).flat_map(|y| (1..ACROSS - 1).map(move |x| (x, y)));
         let (x, y) = inner().max_by_key(|&at| self.around(at))?;
@@ -104,12 +103,12 @@ impl Votes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::track::sight::AtDoor;
+    use crate::track::sensor_view::AtDoor;
 
-    /// What two sensors say of three people who stand anywhere, the second one off by `off`.
+    /// Returns the result for three people who stand anywhere, if the second sensor is off by `off`.
     fn told(off: Point) -> Option<Misplaced> {
         let mut random = fastrand::Rng::with_seed(4);
-        let mut poses = Poses::new(3);
+        let mut poses = PoseVotes::new(3);
         let leg = |at| Leg {
             at,
             sigma_m: 0.04,
@@ -146,7 +145,7 @@ mod tests {
 
     #[test]
     fn legs_that_are_not_known_well_say_nothing() {
-        let mut poses = Poses::new(2);
+        let mut poses = PoseVotes::new(2);
         let leg = |x, is_fresh| Leg {
             at: [x, 0.0],
             sigma_m: 0.07,

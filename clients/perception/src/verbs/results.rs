@@ -1,0 +1,108 @@
+//! Output of `track` and `tilt`: lines of JSON or text, and two topics under the name that the user gives.
+
+use std::hash::{BuildHasher, RandomState};
+use std::io::{self, Write};
+use std::rc::Rc;
+
+use scanhub_client::streams::find;
+use scanhub_client::{Payload, Publication, PublishSession, SensorPublisher};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Failure, Flags, Header};
+use scanhub_shm::Domain;
+use scanhub_verbs::follow::Notice;
+use scanhub_verbs::names::{TopicName, position};
+use scanhub_verbs::output::{End, Output};
+use serde::Serialize;
+
+/// The topics of the name that the results are published under.
+pub(super) struct Topics<A: Payload + ?Sized, B: Payload + ?Sized> {
+    // Fields are dropped in this order: the topics first, then the publisher that wakes their subscribers.
+    pub(super) publications: (Publication<A>, Publication<B>),
+    pub(super) sensor: SensorPublisher,
+}
+
+/// Lines and topics of a run.
+pub(super) struct Results<'a, A: Payload + ?Sized, B: Payload + ?Sized> {
+    /// Name in all lines.
+    pub(super) name: &'a str,
+    pub(super) is_json: bool,
+    /// Fields that all headers share.
+    pub(super) header: Header,
+    /// `None` until [`publish`](Self::publish) has created them.
+    pub(super) topics: Option<Topics<A, B>>,
+    /// Samples of the subscribed topics that were published and not received.
+    pub(super) missed: u64,
+    out: Output<'a>,
+    notes: Output<'a>,
+}
+
+impl<'a, A: Payload + ?Sized, B: Payload + ?Sized> Results<'a, A, B> {
+    /// Creates the output of a run.
+    pub(super) fn new(
+        name: &'a str,
+        is_json: bool,
+        out: &'a mut dyn Write,
+        notes: &'a mut dyn Write,
+    ) -> Self {
+        let hub_pid = std::process::id();
+        let boot = RandomState::new().hash_one(hub_pid);
+        Results {
+            name,
+            is_json,
+            header: Header { boot, sensor: position(name), hub_pid, ..Header::default() },
+            topics: None,
+            missed: 0,
+            out: Output::new(out),
+            notes: Output::new(notes),
+        }
+    }
+
+    /// Creates the topics in the domain in which a hub or listener runs.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::NoHub`](scanhub_schema::Kind) if none runs, and the errors of [`PublishSession::beside`].
+    pub(super) fn publish(&mut self, limits: TopicLimits, places: &[Domain]) -> Result<(), Failure> {
+        let sensor = PublishSession::beside(&find(places)?, self.name, A::TOPIC.maker().topics(), limits)?;
+        self.topics = Some(Topics { publications: (sensor.topic()?, sensor.topic()?), sensor });
+        Ok(())
+    }
+
+    /// Returns the number of samples that were not published because memory was short.
+    pub(super) fn failed(&self) -> u64 {
+        self.topics
+            .as_ref()
+            .map_or(0, |topics| topics.publications.0.failed() + topics.publications.1.failed())
+    }
+
+    /// Takes the flags of a scan with this `header` over: the results are simulated or replayed if the scan is.
+    pub(super) fn take_flags(&mut self, header: &Header) {
+        self.header.flags = header.flags & (Flags::SIMULATED | Flags::REPLAYED);
+    }
+
+    /// Writes a result to stdout, as JSON or text.
+    pub(super) fn result(
+        &mut self,
+        json: &impl Serialize,
+        text: impl FnOnce(&mut Vec<u8>) -> io::Result<()>,
+    ) -> Result<(), End> {
+        if self.is_json { self.out.json(json) } else { self.out.line(text) }
+    }
+
+    /// Writes a line that is not a result: JSON to stdout, or text to stderr.
+    pub(super) fn note(
+        &mut self,
+        json: &impl Serialize,
+        text: impl FnOnce(&mut Vec<u8>) -> io::Result<()>,
+    ) -> Result<(), End> {
+        if self.is_json { self.out.json(json) } else { self.notes.line(text) }
+    }
+
+    /// Writes a notice about subscribed topics.
+    pub(super) fn notice(&mut self, names: &[Rc<TopicName>], notice: &Notice) -> Result<(), End> {
+        if let Notice::Missed(count) = notice {
+            self.missed += count;
+        }
+        notice.tell(names, self.is_json, &mut self.out, &mut self.notes)
+    }
+}
