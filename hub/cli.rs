@@ -20,8 +20,6 @@ pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
-pub(crate) mod watch;
-mod web;
 mod zones;
 
 use std::path::PathBuf;
@@ -52,8 +50,6 @@ pub(crate) use listen::Listen;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
-pub(crate) use watch::Watch;
-pub(crate) use web::Web;
 pub(crate) use zones::Zones;
 
 /// Share laser scanners (SICK LMS 2xx, LDROBOT, RPLIDAR) between programs. One hub reads the ports; any number of programs get
@@ -157,11 +153,9 @@ pub(crate) enum Verb {
     #[command(after_help = latency::SPANS)]
     Latency(Latency),
     /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
-    #[command(after_help = watch::KEYS)]
-    Watch(Watch),
+    Watch(scanhub_viewer::WatchArgs),
     /// Serve the live picture to browsers, and to Foxglove and Lichtblick
-    #[command(after_help = web::VIEWERS)]
-    Web(Web),
+    Web(scanhub_viewer::WebArgs),
     /// Record what the hub publishes in MCAP files
     #[command(after_help = record::READING)]
     Record(Record),

@@ -16,12 +16,10 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::Domain;
-use scanhub_verbs::Bounds;
-use scanhub_viewer::WatchOptions;
+use scanhub_viewer::{WatchArgs, can_show_pictures};
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
 pub(crate) use cast::{Families, World};
 use stage::{Line, Stage};
@@ -95,13 +93,8 @@ fn play_with_picture(
     out: &mut dyn Write,
     stop: &AtomicBool,
 ) -> Result<(Account, End), Failure> {
-    let picture = WatchOptions {
-        sensors: Vec::new(),
-        colours: colours(),
-        note: url.map_or_else(|| attach(stage), |url| short(url, &stage.domain)),
-        bounds: Bounds::default(),
-        places: vec![stage.domain.clone()],
-    };
+    let note = url.map_or_else(|| attach(stage), |url| short(url, &stage.domain));
+    let places = [stage.domain.clone()];
     let (closed, over) = (AtomicBool::new(false), AtomicBool::new(false));
     thread::scope(|scope| {
         let play = scope.spawn(|| {
@@ -110,7 +103,7 @@ fn play_with_picture(
             play(options, stage, &mut |_, _| {}, &is_asked)
         });
         let closing = Raise(&closed);
-        let shown = scanhub_viewer::watch(&picture, out, &over);
+        let shown = WatchArgs::default().show(&note, &places, out, &over);
         drop(closing);
         let played = play.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         shown.and(played)

@@ -144,15 +144,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Latency(latency) => {
             scanhub_verbs::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        // Every signal that ends it must restore the terminal.
         Verb::Watch(watch) => {
-            // The terminal is given back, whoever ends it.
-            let stop = interrupt_by(&ENDS)?;
-            scanhub_viewer::watch(&watch.options(everywhere)?, &mut out, &stop)
+            watch.run(&everywhere.places()?, everywhere.json, &mut out, &*interrupt_by(&ENDS)?)
         }
-        Verb::Web(web) => match &web.replay {
-            Some(file) => replay::page::show(web, file, everywhere, &mut out, &interrupt()?),
-            None => scanhub_viewer::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
-        },
+        Verb::Web(web) => replay::page::run(web, everywhere, &mut out, &interrupt()?),
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
             // Whatever ends it, the file is finished.

@@ -8,7 +8,6 @@ use clap::Args;
 use scanhub_schema::Failure;
 use scanhub_verbs::{LedsLook, LedsOptions, duration};
 
-use super::watch::colours;
 use super::{Everywhere, Limits};
 
 #[derive(Args, Debug)]
@@ -40,7 +39,7 @@ impl Leds {
             led_root: self.led_root.clone(),
             look: match (everywhere.json, stdout().is_terminal()) {
                 (true, _) => LedsLook::Json,
-                (false, true) => LedsLook::Terminal { colours: colours() },
+                (false, true) => LedsLook::Terminal { colours: scanhub_viewer::colors() },
                 (false, false) => LedsLook::Lines,
             },
             hold: self.hold,

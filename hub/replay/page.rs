@@ -10,22 +10,34 @@ use std::thread;
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, PlaybackRate, Player};
 use scanhub_schema::{Failure, Kind};
-use scanhub_viewer::WebOptions;
-use scanhub_viewer::server::{Order, Playback, Progress};
+use scanhub_viewer::WebArgs;
+use scanhub_viewer::server::player::{Playback, PlayerCommand, Progress};
 
-use crate::cli::{Everywhere, Web};
+use crate::cli::Everywhere;
 use crate::own_domain::OwnDomain;
 
-/// Shows `file` until `stop` is set, which is set, too, when its hub ends.
-pub(crate) fn show(
-    web: &Web,
+/// Serves the picture of a hub, or with `--replay` that of a recording.
+pub(crate) fn run(
+    web: &WebArgs,
+    everywhere: &Everywhere,
+    out: &mut dyn Write,
+    stop: &Arc<AtomicBool>,
+) -> Result<(), Failure> {
+    match &web.replay {
+        Some(file) => show(web, file, everywhere, out, stop),
+        None => web.run(&everywhere.places()?, everywhere.json, None, out, stop),
+    }
+}
+
+/// Shows `file` until `stop` is set. The end of its hub sets `stop`, too.
+fn show(
+    web: &WebArgs,
     file: &Path,
     everywhere: &Everywhere,
     out: &mut dyn Write,
     stop: &Arc<AtomicBool>,
 ) -> Result<(), Failure> {
     let domain = OwnDomain::new("web")?;
-    let options = WebOptions { places: vec![domain.clone()], ..web.options(everywhere)? };
     let sources = Sources { files: Sources::system(), ..Sources::default() };
     let replay = scanhub_daemon::Replay {
         file,
@@ -49,7 +61,7 @@ pub(crate) fn show(
         let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let mut shown = Ok(());
         if let Ok(keys) = is_ready.recv() {
-            shown = scanhub_viewer::web(&options, Some(&keys), out, stop);
+            shown = web.run(std::slice::from_ref(domain), everywhere.json, Some(&keys), out, stop);
             keys.0.end();
         }
         match hub.join() {
@@ -64,12 +76,12 @@ pub(crate) fn show(
 struct Keys(Arc<Player>);
 
 impl Playback for Keys {
-    fn order(&self, order: Order) {
-        match order {
-            Order::Toggle => self.0.toggle(),
-            Order::Step => self.0.step(),
-            Order::Faster => self.0.speed_up(),
-            Order::Slower => self.0.slow_down(),
+    fn command(&self, command: PlayerCommand) {
+        match command {
+            PlayerCommand::Toggle => self.0.toggle(),
+            PlayerCommand::Step => self.0.step(),
+            PlayerCommand::Faster => self.0.speed_up(),
+            PlayerCommand::Slower => self.0.slow_down(),
         }
     }
 

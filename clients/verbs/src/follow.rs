@@ -17,14 +17,17 @@ use crate::output::{End, Output};
 pub use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
-/// When a verb that follows topics ends by itself.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+/// Limits after which a verb ends by itself: arguments of every verb that follows topics.
+#[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Bounds {
-    /// After so many samples, of all topics together (`-n`).
+    /// Stop after this number of samples
+    #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
-    /// After this time (`--for`).
+    /// Stop after this time, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = crate::duration::parse)]
     pub run_for: Option<Duration>,
-    /// As a failure, after a silence this long, before the first sample or between two (`--timeout`).
+    /// Exit with 3 after this time without a sample
+    #[arg(long, value_name = "DURATION", value_parser = crate::duration::parse)]
     pub timeout: Option<Duration>,
 }
 
@@ -651,63 +654,4 @@ fn publisher(sensor: &str) -> Who {
 /// Returns whether `who` publishes `name`. The sensors of a robot may come from any publisher.
 fn is_of(name: &TopicName, who: Who) -> bool {
     name.is_robot() || publisher(&name.sensor) == who
-}
-
-/// What a verb does with what it follows.
-pub trait Sink {
-    /// A topic will be followed.
-    fn begin(&mut self, _name: &TopicName) {}
-    /// The topic is there, and what is sent from now on will be received.
-    fn subscribed(&mut self, _name: &TopicName) {}
-    /// A sample came, or one that stands for a silence and does not count.
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End>;
-    /// Something went wrong, or right again, in the streams of `names`.
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End>;
-    /// Comes about ten times a second and after every round of samples.
-    fn tick(&mut self, _now: Instant) -> Result<(), End> {
-        Ok(())
-    }
-    /// When [`tick`](Self::tick) has something to do before that.
-    fn wake_at(&self) -> Option<Instant> {
-        None
-    }
-    /// Whether `topic` is wanted now.
-    fn wants(&self, _topic: Topic) -> bool {
-        true
-    }
-    /// Memory, descriptors or places are too short to follow `name`.
-    fn short(&mut self, _name: &TopicName, failure: Failure) -> Result<(), End> {
-        Err(failure.into())
-    }
-    /// The run is over.
-    fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End>;
-}
-
-/// Follows topics for `sink`.
-pub fn follow(
-    names: &[TopicName],
-    topics: &[Topic],
-    places: &[Domain],
-    bounds: &Bounds,
-    stop: &AtomicBool,
-    sink: &mut dyn Sink,
-) -> Result<(), End> {
-    let mut following = Following::new(names, topics, places, bounds, stop).despite_shortage();
-    let mut run = || {
-        loop {
-            Topic::ALL.into_iter().for_each(|topic| following.want(topic, sink.wants(topic)));
-            match following.next(sink.wake_at())? {
-                None => return Ok(()),
-                Some(Event::Begun(name)) => sink.begin(&name),
-                Some(Event::Subscribed(name)) => sink.subscribed(&name),
-                Some(Event::Sample(name, sample, _)) => sink.sample(&name, &sample)?,
-                Some(Event::Notice(names, notice)) => sink.notice(&names, notice)?,
-                Some(Event::Short(name, failure)) => sink.short(&name, failure)?,
-                Some(Event::Tick(now)) => sink.tick(now)?,
-                Some(Event::Line(..)) => {}
-            }
-        }
-    };
-    let end = run();
-    following.finish(end, |name, stats| sink.summary(name, stats))
 }

@@ -1,11 +1,11 @@
-//! Draws live pictures of what the sensors see: [`watch`] in a terminal, and [`web`] for browsers and Foxglove.
+//! Draws live pictures of a hub's sensors: `watch` in a terminal, and `web` for browsers and Foxglove.
 //!
-//! Both follow a hub into one [`scene`], so that no two pictures disagree. The [`server`] of `web` is the end of what strangers
-//! send: it has channels of bytes and nothing else. A test holds that it names neither a hub nor a file.
+//! Both verbs follow a hub into a [`scene`], so their pictures cannot disagree. Input of strangers ends in the [`server`] of `web`,
+//! which only has channels of bytes. A test holds that it names neither a hub nor a file.
 #![forbid(unsafe_code)]
 
 #[cfg(any(feature = "tui", feature = "web"))]
-mod picture;
+mod live_scene;
 pub mod scene;
 #[cfg(feature = "web")]
 pub mod server;
@@ -13,10 +13,8 @@ pub mod server;
 mod watch;
 #[cfg(feature = "web")]
 mod web;
-#[cfg(any(feature = "tui", feature = "web"))]
-mod work;
 
 #[cfg(feature = "tui")]
-pub use watch::{WatchOptions, watch};
+pub use watch::{WatchArgs, can_show_pictures, colors};
 #[cfg(feature = "web")]
-pub use web::{WEB_PORT, WebOptions, web};
+pub use web::WebArgs;

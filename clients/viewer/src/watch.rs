@@ -1,229 +1,317 @@
-//! `scanhub watch`: what the sensors see, live, as a picture in the terminal. It sleeps until there is new data,
-//! limits the frame rate so that a slow line can carry it, and restores the terminal however it ends.
+//! `scanhub watch`: the live picture in the terminal. It sleeps until there is new data, limits the frame rate for slow lines, and
+//! restores the terminal however it ends.
 
-#[cfg(test)]
-mod asked;
-mod counters;
 mod draw;
-#[cfg(test)]
-mod golden;
-mod hub_requests;
-mod keys;
 mod map;
-mod screen;
+mod terminal;
 mod view;
 
-use std::io::Write;
-use std::rc::Rc;
-use std::sync::atomic::AtomicBool;
+use std::io::{IsTerminal, Write, stdout};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use scanhub_client::clock;
-use scanhub_client::streams::Sample;
-use scanhub_schema::{Failure, Kind, Topic, Verb, check_followed, is_remote};
+use clap::Args;
+use scanhub_client::request;
+use scanhub_schema::{Background, Failure, Kind, Request, Topic, Verb, check_followed, is_remote};
 use scanhub_shm::Domain;
-
-use crate::picture;
-use scanhub_verbs::follow::{Bounds, Notice, ReceiveStats, Sink, follow};
-use scanhub_verbs::names::{TopicName, as_word};
+use scanhub_verbs::Bounds;
+use scanhub_verbs::follow::{Event, Following, Notice};
+use scanhub_verbs::names::as_word;
 use scanhub_verbs::output::{End, quiet};
 
+use crate::live_scene::{LiveScene, TOPICS, followed};
 use crate::scene::Scene;
-use crate::work::Work;
-use hub_requests::HubRequests;
-use keys::Key;
-use screen::{News, Screen};
-use view::{View, Wish};
+use terminal::{Input, Key, Terminal};
+use view::{View, ViewCommand};
 
-/// What `watch` is asked for.
-#[derive(Clone, Debug)]
-pub struct WatchOptions {
-    /// The sensors; none: all of the hub.
-    pub sensors: Vec<String>,
-    /// Colours may be used.
-    pub colours: bool,
-    /// What stands below the picture beside the keys; empty: nothing.
-    pub note: String,
-    /// When it ends by itself; a person ends it at any time.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `watch`.
+#[derive(Args, Clone, Debug, Default)]
+#[command(after_help = KEYS)]
+pub struct WatchArgs {
+    /// Sensors to show [default: all]
+    #[arg(value_name = "SENSOR")]
+    sensors: Vec<String>,
+    #[command(flatten)]
+    limits: Bounds,
 }
 
-/// Shows the picture on the terminal that `out` writes to, until a person ends it, the bounds are reached or `stop` is set.
-///
-/// [`Kind::Failed`] if there is no terminal that can be taken over, [`Kind::Interrupted`] if Ctrl-C ends a bounded run;
-/// else as [`echo`](crate::echo()).
-pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    let (names, topics) = picture::followed(&options.sensors, &picture::TOPICS, &options.places);
-    let end = Screen::new(out).and_then(|screen| {
-        let mut watcher = Watcher {
-            options,
-            scene: Scene::default(),
-            held: None,
-            view: View { note: options.note.clone(), ..View::new(options.colours) },
-            screen,
-            requests: HubRequests::default(),
-            work: Work::default(),
-            changed: true,
-            draw_at: Instant::now(),
-            news_until: None,
-        };
-        follow(&names, &topics, &options.places, &options.bounds, stop, &mut watcher)
-    });
-    quiet(end)
+const KEYS: &str = "\
+Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours. From another machine: ssh -t robot scanhub watch.";
+
+/// Minimum interval between two frames, so that a scan is on the screen within 50 ms.
+const FRAME_INTERVAL: Duration = Duration::from_millis(45);
+/// Bytes per second that frames may need. On a slow line there are fewer frames.
+const BYTES_PER_SECOND: f64 = 80_000.0;
+/// Time for which a message takes the place of the keys.
+const MESSAGE_TIME: Duration = Duration::from_secs(4);
+
+impl WatchArgs {
+    /// Shows the picture of the first live domain of `places` on the terminal that `out` writes to, until the user quits, the
+    /// limits are reached or `stop` is set.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Usage`] with `json`, without a terminal, or if a sensor's name is not valid.
+    /// - [`Kind::Failed`] if the terminal cannot be used.
+    /// - [`Kind::Interrupted`] if Ctrl-C ends a bounded run.
+    /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] as for `echo`.
+    pub fn run(
+        &self,
+        places: &[Domain],
+        json: bool,
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        if json || !can_show_pictures() {
+            let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
+            let hint = format!("lines for files and programs: scanhub echo {sensor}, with --json as objects");
+            let what = if json { "a picture is no JSON" } else { "the picture needs a terminal" };
+            return Err(Failure::new(Kind::Usage, what, hint));
+        }
+        self.show("", places, out, stop)
+    }
+
+    /// Does the same as [`run`](Self::run) with a `note` next to the keys, and without checking for a terminal.
+    ///
+    /// # Errors
+    ///
+    /// As for [`run`](Self::run).
+    pub fn show(
+        &self,
+        note: &str,
+        places: &[Domain],
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        self.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+        let (names, topics) = followed(&self.sensors, &TOPICS, places);
+        let end = Terminal::new(out).and_then(|terminal| {
+            let mut watcher = Watcher {
+                places,
+                is_bounded: self.limits.bounded(),
+                live: LiveScene::default(),
+                held: None,
+                view: View { note: note.to_owned(), ..View::new(colors()) },
+                terminal,
+                request: BackgroundRequest::default(),
+                changed: true,
+                draw_at: Instant::now(),
+                message_until: None,
+            };
+            let following = Following::new(&names, &topics, places, &self.limits, stop);
+            watcher.follow(&mut following.despite_shortage())
+        });
+        quiet(end)
+    }
+}
+
+/// Returns whether stdout is a terminal with cursor control.
+pub fn can_show_pictures() -> bool {
+    stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
+}
+
+/// Returns whether colors may be used: `NO_COLOR` is unset or empty (<https://no-color.org>).
+pub fn colors() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
 struct Watcher<'a> {
-    options: &'a WatchOptions,
-    scene: Scene,
-    /// The scene whose picture is shown while that is held; the verdict and the sensors' lines go on.
+    /// Locations where the domain may be.
+    places: &'a [Domain],
+    /// Whether the run ends by itself, so that Ctrl-C is a failure.
+    is_bounded: bool,
+    live: LiveScene,
+    /// Scene of the frozen picture. Its verdict and the lines of sensors are still live.
     held: Option<Scene>,
     view: View,
-    screen: Screen<'a>,
-    requests: HubRequests,
-    work: Work,
-    /// The screen does not show what is known.
+    terminal: Terminal<'a>,
+    request: BackgroundRequest,
+    /// Whether the screen is out of date.
     changed: bool,
-    /// No frame before.
+    /// Earliest time of the next frame.
     draw_at: Instant,
-    news_until: Option<Instant>,
+    message_until: Option<Instant>,
 }
 
 impl Watcher<'_> {
-    fn tell(&mut self, news: String, now: Instant) {
-        self.view.news = news;
-        self.news_until = Some(now + READING_TIME);
+    /// Shows a message in place of the keys.
+    fn say(&mut self, message: String, now: Instant) {
+        self.view.message = message;
+        self.message_until = Some(now + MESSAGE_TIME);
         self.changed = true;
     }
 
-    /// Does what was typed; a resized window is redrawn.
-    fn listen(&mut self, now: Instant) -> Result<(), End> {
-        while let Some(news) = self.screen.news()? {
+    /// Handles keys, the mouse, and a new size of the terminal.
+    fn handle_input(&mut self, now: Instant) -> Result<(), End> {
+        while let Some(input) = self.terminal.input()? {
             self.changed = true;
-            // A person who types waits for the answer; a mouse says more than can be drawn.
-            if !matches!(news, News::Key(Key::Point(..))) {
+            // Keys are answered at once, but a mouse sends more than can be drawn.
+            if !matches!(input, Input::Key(Key::Point(..))) {
                 self.draw_at = now;
             }
-            let News::Key(key) = news else { continue };
-            let wish = self.view.key(key, &self.scene);
+            let Input::Key(key) = input else { continue };
+            let command = self.view.key(key, &self.live.scene);
             if !self.view.lines {
-                self.scene.forget_lines();
+                self.live.scene.forget_lines();
             }
             match (self.view.paused, &self.held) {
-                (true, None) => self.held = Some(self.scene.clone()),
+                (true, None) => self.held = Some(self.live.scene.clone()),
                 (false, Some(_)) => self.held = None,
                 _ => {}
             }
-            match wish {
-                Some(Wish::Interrupt) if self.options.bounds.bounded() => {
+            match command {
+                Some(ViewCommand::Interrupt) if self.is_bounded => {
                     return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
                 }
-                Some(Wish::Quit | Wish::Interrupt) => return Err(End::ReaderGone),
-                Some(Wish::Reset) => self.order(Verb::Reset, now),
-                Some(Wish::Freeze) => self.order(Verb::Freeze, now),
+                Some(ViewCommand::Quit | ViewCommand::Interrupt) => return Err(End::ReaderGone),
+                Some(ViewCommand::Reset) => self.request(Verb::Reset, now),
+                Some(ViewCommand::Freeze) => self.request(Verb::Freeze, now),
                 None => {}
             }
         }
         Ok(())
     }
 
-    /// Asks the hub about the background of the sensors that are shown; where all of them are frozen already they thaw.
-    fn order(&mut self, verb: Verb, now: Instant) {
-        let shown = self.view.shown(&self.scene);
+    /// Requests `verb` for the background of the shown sensors. If all of them are frozen, a freeze thaws them.
+    fn request(&mut self, verb: Verb, now: Instant) {
+        let shown = self.view.shown(&self.live.scene);
         let own: Vec<_> = shown.into_iter().filter(|(_, sensor)| !is_remote(&sensor.name)).collect();
         let is_frozen = !own.is_empty() && own.iter().all(|(_, sensor)| sensor.is_frozen());
         let sensors: Vec<_> = own.into_iter().map(|(_, sensor)| sensor.name.clone()).collect();
         if sensors.is_empty() {
-            return self.tell("no sensor of this machine is shown".into(), now);
+            return self.say("no sensor of this machine is shown".into(), now);
         }
         let verb = if verb == Verb::Freeze && is_frozen { Verb::Thaw } else { verb };
-        if !self.requests.give(&self.options.places, sensors, verb) {
-            self.tell("the hub still works on the last request".into(), now);
+        if !self.request.start(self.places, sensors, verb) {
+            self.say("the hub still works on the last request".into(), now);
         }
     }
 
     fn draw(&mut self, now: Instant) -> Result<(), End> {
-        let (scene, held, view) = (&self.scene, self.held.as_ref(), &mut self.view);
-        let bytes = self.screen.draw(|frame| {
-            view.map = draw::place_of_map(frame.area(), scene);
+        let (scene, held, view) = (&self.live.scene, self.held.as_ref(), &mut self.view);
+        let bytes = self.terminal.draw(|frame| {
+            view.map = draw::map_area(frame.area(), scene);
             view.fit(held.unwrap_or(scene));
             draw::draw(frame, scene, held, view);
         })?;
         self.changed = false;
-        self.draw_at = now + FRAME.max(Duration::from_secs_f64(bytes as f64 / BYTES_PER_SECOND));
+        self.draw_at = now + FRAME_INTERVAL.max(Duration::from_secs_f64(bytes as f64 / BYTES_PER_SECOND));
         Ok(())
     }
 }
 
-impl Sink for Watcher<'_> {
-    fn begin(&mut self, name: &TopicName) {
-        picture::begin(&mut self.scene, name);
-    }
-
-    fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        picture::take(&mut self.scene, name, sample);
-        self.changed = true;
-        Ok(())
-    }
-
-    fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
-        picture::note(&mut self.scene, names, &notice);
-        self.changed = true;
-        if let Notice::NoHub(Failure { message, hint, .. }) = notice {
-            self.tell(format!("{message}: {hint}"), Instant::now());
+impl Watcher<'_> {
+    fn follow(&mut self, following: &mut Following<'_>) -> Result<(), End> {
+        loop {
+            following.want(Topic::Lines, self.view.lines);
+            let Some(event) = following.next(self.changed.then_some(self.draw_at))? else { return Ok(()) };
+            match event {
+                Event::Begun(name) => self.live.begin(&name),
+                Event::Sample(name, sample, _) => {
+                    self.live.take(&name, &sample);
+                    self.changed = true;
+                }
+                Event::Notice(names, notice) => {
+                    self.live.note(&names, &notice);
+                    self.changed = true;
+                    if let Notice::NoHub(Failure { message, hint, .. }) = notice {
+                        self.say(format!("{message}: {hint}"), Instant::now());
+                    }
+                }
+                // The topics that are followed already stay.
+                Event::Short(name, Failure { message, hint, .. }) => {
+                    self.say(format!("{name} is not shown: {message}; {hint}"), Instant::now());
+                }
+                Event::Tick(now) => self.tick(now)?,
+                Event::Subscribed(_) | Event::Line(..) => {}
+            }
         }
-        Ok(())
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {
-        self.listen(now)?;
-        if let Some(done) = self.requests.done() {
-            for (sensor, model) in done.models {
-                self.scene.sensor(&sensor).background = Some(model);
+        self.handle_input(now)?;
+        if let Some(outcome) = self.request.outcome() {
+            for (sensor, model) in outcome.models {
+                self.live.scene.sensor(&sensor).background = Some(model);
             }
-            self.tell(done.news, now);
+            self.say(outcome.message, now);
         }
-        if self.news_until.is_some_and(|until| now >= until) {
-            self.news_until = None;
-            self.view.news.clear();
+        if self.message_until.is_some_and(|until| now >= until) {
+            self.message_until = None;
+            self.view.message.clear();
             self.changed = true;
         }
-        self.changed |= self.scene.age(clock::now_ns());
-        if self.scene.hub_pid != 0 {
-            let percent = self.work.look(self.scene.hub_pid, now);
-            self.changed |= percent != self.scene.hub_percent;
-            self.scene.hub_percent = percent;
-        }
+        self.changed |= self.live.age();
+        self.changed |= self.live.measure_hub(now);
         if self.changed && now >= self.draw_at {
             self.draw(now)?;
         }
         Ok(())
     }
+}
 
-    fn wants(&self, topic: Topic) -> bool {
-        topic != Topic::Lines || self.view.lines
+/// A request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, because a slow hub must not delay the
+/// picture. There is at most one at a time.
+#[derive(Default)]
+struct BackgroundRequest {
+    running: Option<JoinHandle<RequestOutcome>>,
+    stop: Arc<AtomicBool>,
+}
+
+struct RequestOutcome {
+    /// Text for the user.
+    message: String,
+    /// Sensors with their backgrounds afterwards.
+    models: Vec<(String, Box<Background>)>,
+}
+
+impl BackgroundRequest {
+    /// Sends `verb` to the hub for each of `sensors`. Returns false if the last request is still running.
+    fn start(&mut self, places: &[Domain], sensors: Vec<String>, verb: Verb) -> bool {
+        if self.running.is_some() {
+            return false;
+        }
+        let (places, stop) = (places.to_vec(), self.stop.clone());
+        self.running = Some(std::thread::spawn(move || send_request(&places, &sensors, verb, &stop)));
+        true
     }
 
-    /// What is followed already is shown.
-    fn short(&mut self, name: &TopicName, failure: Failure) -> Result<(), End> {
-        self.tell(format!("{name} is not shown: {}; {}", failure.message, failure.hint), Instant::now());
-        Ok(())
-    }
-
-    fn wake_at(&self) -> Option<Instant> {
-        self.changed.then_some(self.draw_at)
-    }
-
-    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
-        Ok(())
+    /// Returns the outcome once, after the request has ended.
+    fn outcome(&mut self) -> Option<RequestOutcome> {
+        self.running.take_if(|running| running.is_finished())?.join().ok()
     }
 }
 
-/// Between two frames: what a scan shows is on the screen within 50 ms.
-const FRAME: Duration = Duration::from_millis(45);
-/// A line that carries no more shows fewer frames.
-const BYTES_PER_SECOND: f64 = 80_000.0;
-/// How long news stand where the keys are told.
-const READING_TIME: Duration = Duration::from_secs(4);
+impl Drop for BackgroundRequest {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // The thread occupies a slot of the domain until it ends.
+        let _ = self.running.take().map(JoinHandle::join);
+    }
+}
+
+fn send_request(places: &[Domain], sensors: &[String], verb: Verb, stop: &AtomicBool) -> RequestOutcome {
+    let mut models = Vec::new();
+    let mut send = |sensor: &String| -> Result<(), Failure> {
+        request(places, &Request::new(sensor, verb), stop)?;
+        let shown = request(places, &Request::new(sensor, Verb::Show), stop)?;
+        models.extend(shown.map(|shown| (sensor.clone(), shown.model)));
+        Ok(())
+    };
+    let outcome = match verb {
+        Verb::Reset => "is learned again",
+        Verb::Freeze => "is frozen",
+        Verb::Thaw => "continues learning",
+        other => other.name(),
+    };
+    let message = match sensors.iter().try_for_each(&mut send) {
+        Ok(()) => format!("{}: background {outcome}", sensors.join(", ")),
+        Err(failure) => failure.to_string(),
+    };
+    RequestOutcome { message, models }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,130 +1,205 @@
-//! `scanhub web`: what the sensors see, live, for browsers and for viewers of `foxglove.sdk.v1`. Follows the hub as `watch`
-//! does, into the same scene, and puts up what that becomes; a thread of its own serves whoever looks at it.
+//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread follows the hub, and publishes
+//! on channels; another thread serves them.
 
-mod feeder;
-mod sensor;
-mod tilted;
-mod told;
+mod channels;
+mod feed;
 
 use std::fmt;
 use std::io::Write;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::mpsc::{self, Receiver, TryRecvError};
 use std::thread;
+use std::time::{Duration, Instant};
 
-use crate::server::{Board, Door, Playback, Server};
+use clap::Args;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
+use scanhub_files::regular;
 use scanhub_schema::{Failure, Kind, Maker, check_followed};
 use scanhub_shm::Domain;
+use scanhub_verbs::Bounds;
+use scanhub_verbs::follow::Following;
+use scanhub_verbs::names::{TopicName, as_word};
+use scanhub_verbs::output::{End, Output, quiet};
+use serde::Serialize;
 
-use crate::picture;
-use feeder::Feeder;
-use scanhub_verbs::follow::{Bounds, follow};
-use scanhub_verbs::names::as_word;
-use scanhub_verbs::output::{Output, quiet};
+use crate::live_scene::{TOPICS, followed};
+use crate::server::player::Playback;
+use crate::server::{AccessPolicy, ChannelStore, Event, Server, ViewerEvent};
+use feed::Feed;
 
-/// What `web` is asked for.
-#[derive(Clone, Debug)]
-pub struct WebOptions {
-    /// The sensors; none: all of the hub.
-    pub sensors: Vec<String>,
-    /// Where it listens; if the port is taken, on one of the next.
-    pub listen: SocketAddr,
-    /// The word that viewers have to know.
-    pub token: Option<String>,
-    /// Who reaches the address may look, without a word.
-    pub open: bool,
-    /// Pages from elsewhere whose viewers may come.
-    pub origins: Vec<String>,
-    /// Names of this machine by which a browser may come, beside its addresses.
-    pub names: Vec<String>,
-    /// File that the token was read from, if it was.
-    pub token_file: Option<PathBuf>,
-    /// JSON instead of text.
-    pub json: bool,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `web`.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = VIEWERS)]
+pub struct WebArgs {
+    /// Sensors to show [default: all]
+    #[arg(value_name = "SENSOR")]
+    sensors: Vec<String>,
+    /// Address to listen on: an IP address or localhost, a port, or both. 0.0.0.0 or :: for other machines, which needs --token. If the
+    /// port is in use, the next free one
+    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
+    listen: SocketAddr,
+    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted, and other users
+    /// of this machine see it in the list of processes, unless it comes from the environment or --token-file
+    #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = token)]
+    token: Option<String>,
+    /// File with the word as its only line, which only this user can read. It goes before --token
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Serve everyone who can reach the address, without a token
+    #[arg(long, conflicts_with_all = ["token", "token_file"])]
+    open: bool,
+    /// Accept viewers that are served from this URL. Can be repeated
+    #[arg(long = "allow-origin", value_name = "URL")]
+    origins: Vec<String>,
+    /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files: MCAP,
+    /// telegram stream or CARMEN log, plain or gzipped
+    #[arg(long, value_name = "FILE")]
+    pub replay: Option<PathBuf>,
+    /// Start the recording again at its end
+    #[arg(long = "loop", requires = "replay")]
+    pub is_looped: bool,
+    #[command(flatten)]
+    limits: Bounds,
 }
 
-/// Port that is served if none is named.
-pub const WEB_PORT: u16 = 8080;
+const VIEWERS: &str = "\
+Open the printed address in a browser. Foxglove and Lichtblick: open connection, Foxglove WebSocket, the same address with ws:.";
 
-/// Serves the picture until the bounds are reached or `stop` is set; says on `out` where, and who comes and goes. Viewers
-/// have the keys of `player`, if there is one, whose hub no one else has.
-///
-/// [`Kind::Usage`] if it would listen beyond this machine without a word; [`Kind::Failed`] if it cannot listen; else as
-/// [`echo`](crate::echo()).
-pub fn web(
-    options: &WebOptions,
-    player: Option<&dyn Playback>,
-    out: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    if !options.listen.ip().is_loopback() && options.token.is_none() && !options.open {
-        let what = format!("other machines could watch at {}", options.listen);
-        let hint = "set a token for viewers (--token WORD), or allow everyone (--open)";
-        return Err(Failure::new(Kind::Usage, what, hint));
-    }
-    if options.token.as_deref().is_some_and(|token| !is_word(token)) {
-        let hint = "--token WORD: letters, digits and . _ ~ -, which an address shows as they are";
-        return Err(Failure::new(Kind::Usage, "the token is no word", hint));
-    }
-    let door =
-        Door { token: options.token.clone(), origins: options.origins.clone(), names: options.names.clone() };
-    let server = Server::bind(options.listen, door)?;
-    let board = Board::new()?;
-    let (tell, events) = mpsc::channel();
-    let mut output = Output::new(out);
-    let urls = urls(server.address(), &reachable_addresses(), &options.names, options.token.as_deref());
-    if let Err(end) = told::ready(&mut output, &urls, options) {
-        return quiet(Err(end));
-    }
-    let wanted = [&picture::TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
-    let (names, topics) = picture::followed(&options.sensors, &wanted, &options.places);
-    let over = AtomicBool::new(false);
-    thread::scope(|scope| {
-        let served = thread::Builder::new()
-            .name("web".into())
-            // What tells goes with it: who feeds hears that it ended.
-            .spawn_scoped(scope, {
-                let (server, board, over) = (&server, &board, &over);
-                move || server.run(board, player, &tell, over)
-            })
-            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
-        let closing = Close { over: &over, board: &board };
-        let mut feeder = Feeder::new(options, player, &board, events, output);
-        let end = follow(&names, &topics, &options.places, &options.bounds, stop, &mut feeder);
-        drop(closing);
-        match served.join() {
-            Ok(Ok(())) => quiet(end),
-            Ok(Err(failure)) => Err(failure),
-            // It has said why.
-            Err(_) => Err(Failure::new(Kind::Failed, "what serves the viewers ended", "start it again")),
+/// Port if `--listen` names only an address.
+const DEFAULT_PORT: u16 = 8080;
+/// Maximum size of a file with a token, in bytes.
+const MAX_TOKEN_FILE: u64 = 4096;
+/// Minimum interval between two reports of a topic that is not served.
+const REPORT_INTERVAL: Duration = Duration::from_secs(10);
+
+impl WebArgs {
+    /// Serves the sensors of the first live domain of `places`, until the limits are reached or `stop` is set. Prints the URLs,
+    /// and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if there is one.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Input`] or [`Kind::Configuration`] if the token cannot be read from its file.
+    /// - [`Kind::Usage`] if a sensor's name is not valid, or if other machines could connect without a token.
+    /// - [`Kind::Failed`] if the server cannot listen or wait, or its thread ends.
+    /// - [`Kind::NoHub`], [`Kind::NoTopic`], [`Kind::Timeout`] and [`Kind::Interrupted`] as for `echo`.
+    pub fn run(
+        &self,
+        places: &[Domain],
+        json: bool,
+        player: Option<&dyn Playback>,
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let token = match &self.token_file {
+            Some(file) => Some(read_token(file)?),
+            None => self.token.clone(),
+        };
+        self.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+        if !self.listen.ip().is_loopback() && token.is_none() && !self.open {
+            let what = format!("other machines could watch at {}", self.listen);
+            let hint = "set a token for viewers (--token WORD), or allow everyone (--open)";
+            return Err(Failure::new(Kind::Usage, what, hint));
         }
-    })
+        let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
+        let policy = AccessPolicy { token, origins: self.origins.clone(), names: vec![host.clone()] };
+        let urls = |address| urls(address, &reachable_addresses(), &host, policy.token.as_deref());
+        let server = Server::bind(self.listen, policy.clone())?;
+        let channels = ChannelStore::new()?;
+        let (report, events) = mpsc::channel();
+        let mut reporter = Reporter { output: Output::new(out), events, json, short_at: None };
+        if let Err(end) = reporter.ready(&urls(server.address()), self) {
+            return quiet(Err(end));
+        }
+        let wanted = [&TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
+        let (names, topics) = followed(&self.sensors, &wanted, places);
+        let is_over = AtomicBool::new(false);
+        thread::scope(|scope| {
+            let served = thread::Builder::new()
+                .name("web".into())
+                // The thread owns `report`, so its end closes the channel of events.
+                .spawn_scoped(scope, {
+                    let (server, channels, is_over) = (&server, &channels, &is_over);
+                    move || server.run(channels, player, &report, is_over)
+                })
+                .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
+            let closing = StopServer { is_over: &is_over, channels: &channels };
+            let mut feed = Feed::new(&channels, places, player, reporter);
+            let following = Following::new(&names, &topics, places, &self.limits, stop);
+            let end = feed.follow(&mut following.despite_shortage());
+            drop(closing);
+            match served.join() {
+                Ok(Ok(())) => quiet(end),
+                Ok(Err(failure)) => Err(failure),
+                // The panic has printed its reason.
+                Err(_) => Err(Failure::new(Kind::Failed, "what serves the viewers ended", "start it again")),
+            }
+        })
+    }
 }
 
-/// Whether browsers send it as it was written.
-fn is_word(token: &str) -> bool {
-    !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._~-".contains(&byte))
+/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as does
+/// `localhost`.
+fn listen_address(text: &str) -> Result<SocketAddr, String> {
+    let without_brackets = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
+    if let Ok(address) = text.parse() {
+        return Ok(address);
+    }
+    if let Ok(ip) = without_brackets.parse::<IpAddr>() {
+        return Ok(SocketAddr::new(ip, DEFAULT_PORT));
+    }
+    if text == "localhost" {
+        return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT)));
+    }
+    let port = text.strip_prefix("localhost:").or_else(|| text.strip_prefix(':')).unwrap_or(text);
+    if let Ok(port) = port.parse() {
+        return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
+    }
+    Err("use localhost or an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
+}
+
+/// Parses a token, which is part of a URL as it is.
+fn token(text: &str) -> Result<String, String> {
+    let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "-._~".contains(sign);
+    match !text.is_empty() && text.chars().all(is_plain) {
+        true => Ok(text.to_owned()),
+        false => Err("letters, digits and - . _ ~".to_owned()),
+    }
+}
+
+/// Returns the token in `file`.
+///
+/// # Errors
+///
+/// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token, or if others can use it.
+fn read_token(file: &Path) -> Result<String, Failure> {
+    let place = file.display().to_string();
+    let unreadable = |error: std::io::Error| regular::unreadable(&place, &error);
+    let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(unreadable)?;
+    let mode = file.metadata().map_err(unreadable)?.mode() & 0o777;
+    if mode & 0o077 != 0 {
+        let message = format!("{place} has mode {mode:04o}, so others can use the token");
+        return Err(Failure::new(Kind::Configuration, message, "`chmod 600` it"));
+    }
+    token(text.trim_end()).map_err(|expected| {
+        let hint = format!("one line with one word: {expected}");
+        Failure::new(Kind::Configuration, format!("{place} contains no token"), hint)
+    })
 }
 
 /// Returns the URLs of the page. If the server listens on all addresses, they have the name of this machine, if it is known,
 /// and then each address in `reachable` of the same version of IP.
-fn urls(address: SocketAddr, reachable: &[IpAddr], names: &[String], token: Option<&str>) -> Vec<String> {
+fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&str>) -> Vec<String> {
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
     let of = |host: &dyn fmt::Display| format!("http://{host}/{token}");
     if !address.ip().is_unspecified() {
         return vec![of(&address)];
     }
     let port = address.port();
-    let name = names.first().map(|name| of(&format!("{name}:{port}")));
+    let name = (!host.is_empty()).then(|| of(&format!("{host}:{port}")));
     // A socket for all IPv6 addresses accepts IPv4 too.
     let accepted = reachable.iter().filter(|one| address.is_ipv6() || one.is_ipv4());
     let urls: Vec<String> =
@@ -149,101 +224,233 @@ fn reachable_addresses() -> Vec<IpAddr> {
     addresses.filter(|address| !is_local(address)).collect()
 }
 
-/// Ends the thread that serves, however this one ends.
-struct Close<'a> {
-    over: &'a AtomicBool,
-    board: &'a Board,
+/// Ends the server's thread when it is dropped, even by a panic.
+struct StopServer<'a> {
+    is_over: &'a AtomicBool,
+    channels: &'a ChannelStore,
 }
 
-impl Drop for Close<'_> {
+impl Drop for StopServer<'_> {
     fn drop(&mut self) {
-        self.over.store(true, Ordering::Relaxed);
-        self.board.ring();
+        self.is_over.store(true, Ordering::Relaxed);
+        self.channels.wake();
+    }
+}
+
+/// Prints the lines of `web`.
+struct Reporter<'a> {
+    output: Output<'a>,
+    /// Reports of the server.
+    events: Receiver<Event>,
+    json: bool,
+    /// Earliest time of the next report of a topic that is not served.
+    short_at: Option<Instant>,
+}
+
+impl Reporter<'_> {
+    /// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the flags for
+    /// other machines, and with `--open` a warning.
+    fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), End> {
+        #[derive(Serialize)]
+        struct Ready<'a> {
+            class: &'static str,
+            url: &'a str,
+            urls: &'a [String],
+            pid: u32,
+        }
+        let url = urls.first().map_or("", String::as_str);
+        if self.json {
+            return self.output.json(&Ready { class: "ready", url, urls, pid: std::process::id() });
+        }
+        self.output.line(|line| write!(line, "ready {url}"))?;
+        if let [_, others @ ..] = urls
+            && !others.is_empty()
+        {
+            self.output.line(|line| write!(line, "or {}", others.join(" ")))?;
+        }
+        if !args.listen.ip().is_loopback() {
+            if !args.open {
+                return Ok(());
+            }
+            let warning = "anyone who can reach this address can watch; to restrict that: --token WORD";
+            return self.output.line(|line| write!(line, "{warning}"));
+        }
+        let port = match args.listen.port() {
+            DEFAULT_PORT => String::new(),
+            port => format!(":{port}"),
+        };
+        let token = match (&args.token_file, &args.token) {
+            (Some(file), _) => format!("--token-file {}", file.display()),
+            (None, token) => format!("--token {}", token.as_deref().unwrap_or("WORD")),
+        };
+        self.output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} {token}"))
+    }
+
+    /// Prints why there is no hub to serve yet, and the command that reaches another one. With JSON, viewers alone get the reason.
+    fn no_hub(&mut self, failure: &Failure) -> Result<(), End> {
+        match self.json {
+            true => Ok(()),
+            false => self.output.line(|line| write!(line, "{}; {}", failure.message, failure.hint)),
+        }
+    }
+
+    /// Prints the events of the server that have arrived.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`End::ReaderGone`] if the server has ended. Its thread has the reason.
+    fn report_events(&mut self) -> Result<(), End> {
+        loop {
+            match self.events.try_recv() {
+                Ok(Event::Viewer(event)) => self.viewer(&event)?,
+                Ok(Event::Short(error)) => {
+                    let hint = "raise the limit of descriptors: ulimit -n";
+                    self.short(&format!("cannot accept viewers: {error}"), hint)?;
+                }
+                Err(TryRecvError::Empty) => return Ok(()),
+                Err(TryRecvError::Disconnected) => return Err(End::ReaderGone),
+            }
+        }
+    }
+
+    fn viewer(&mut self, event: &ViewerEvent) -> Result<(), End> {
+        #[derive(Serialize)]
+        struct Client {
+            class: &'static str,
+            address: String,
+            came: bool,
+            skipped: u64,
+            clients: usize,
+        }
+        let ViewerEvent { address, connected, skipped, viewers } = *event;
+        let word = if connected { "came" } else { "went" };
+        match self.json {
+            true => self.output.json(&Client {
+                class: "client",
+                address: address.to_string(),
+                came: connected,
+                skipped,
+                clients: viewers,
+            }),
+            false => {
+                self.output.line(|line| write!(line, "{address} {word}, {viewers} here, {skipped} skipped"))
+            }
+        }
+    }
+
+    /// Prints that a topic is not served, because the system is short of something, unless that was just printed.
+    fn not_served(&mut self, name: &TopicName, failure: &Failure) -> Result<(), End> {
+        let now = Instant::now();
+        if self.short_at.is_some_and(|at| now < at) {
+            return Ok(());
+        }
+        self.short_at = Some(now + REPORT_INTERVAL);
+        self.short(&format!("{name} is not served: {}", failure.message), &failure.hint)
+    }
+
+    fn short(&mut self, message: &str, hint: &str) -> Result<(), End> {
+        #[derive(Serialize)]
+        struct Short<'a> {
+            class: &'static str,
+            message: &'a str,
+            hint: &'a str,
+        }
+        match self.json {
+            true => self.output.json(&Short { class: "web_short", message, hint }),
+            false => self.output.line(|line| write!(line, "{message}; {hint}")),
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::server::{Order, Progress};
     use std::io;
     use std::net::TcpStream;
-    use std::time::Duration;
+    use std::os::unix::fs::OpenOptionsExt;
 
-    fn options(listen: &str) -> WebOptions {
-        WebOptions {
+    use super::*;
+    use crate::server::player::{PlayerCommand, Progress};
+
+    fn args(listen: &str) -> WebArgs {
+        WebArgs {
             sensors: Vec::new(),
             listen: listen.parse().unwrap(),
             token: None,
+            token_file: None,
             open: false,
             origins: Vec::new(),
-            names: Vec::new(),
-            token_file: None,
-            json: false,
-            bounds: Bounds::default(),
-            places: Vec::new(),
+            replay: None,
+            is_looped: false,
+            limits: Bounds::default(),
         }
     }
 
+    fn run(args: &WebArgs, json: bool) -> (Result<(), Failure>, String) {
+        let mut out = Vec::new();
+        let result = args.run(&[], json, None, &mut out, &AtomicBool::new(true));
+        (result, String::from_utf8(out).unwrap())
+    }
+
     #[test]
-    fn beyond_this_machine_a_word_is_needed() {
-        let stop = AtomicBool::new(true);
+    fn other_machines_need_a_token() {
         for listen in ["0.0.0.0:0", "[::]:0"] {
-            let failure = web(&options(listen), None, &mut Vec::new(), &stop).unwrap_err();
+            let failure = run(&args(listen), false).0.unwrap_err();
             assert_eq!(failure.kind, Kind::Usage);
             assert_eq!(failure.message, format!("other machines could watch at {listen}"));
             assert!(failure.hint.contains("--token"), "{failure}");
-            let open = WebOptions { open: true, ..options(listen) };
-            assert!(
-                web(&open, None, &mut Vec::new(), &stop).map_err(|failure| failure.kind) != Err(Kind::Usage)
-            );
+            let open = WebArgs { open: true, ..args(listen) };
+            assert_ne!(run(&open, false).0.map_err(|failure| failure.kind), Err(Kind::Usage));
         }
-        assert!(web(&options("127.0.0.1:0"), None, &mut Vec::new(), &stop).is_ok());
+        assert!(run(&args("127.0.0.1:0"), false).0.is_ok());
     }
 
     #[test]
     fn text_output_shows_how_other_machines_get_access() {
-        let stop = AtomicBool::new(true);
-        let text = |options: &WebOptions| {
-            let mut out = Vec::new();
-            web(options, None, &mut out, &stop).unwrap();
-            String::from_utf8(out).unwrap()
+        let text = |args: &WebArgs| {
+            let (result, text) = run(args, false);
+            result.map(|()| text).unwrap()
         };
-        let local = text(&options("127.0.0.1:0"));
+        let local = text(&args("127.0.0.1:0"));
         let [ready, others] = &local.lines().collect::<Vec<_>>()[..] else { panic!("{local}") };
         assert!(ready.starts_with("ready http://127.0.0.1:"), "{local}");
         assert_eq!(*others, "for other machines: --listen 0.0.0.0:0 --token WORD");
         let token = Some("carrot".to_owned());
-        let all = text(&WebOptions { token, names: vec!["robot".to_owned()], ..options("0.0.0.0:0") });
-        assert!(all.starts_with("ready http://robot:") && !all.contains("anyone"), "{all}");
-        let (token, token_file) = (Some("carrot".to_owned()), Some("/etc/word".into()));
-        let local = text(&WebOptions { token, token_file, ..options("127.0.0.1:0") });
-        assert!(local.ends_with(" --token-file /etc/word\n"), "{local}");
-        let open = text(&WebOptions { open: true, ..options("0.0.0.0:0") });
+        let all = text(&WebArgs { token, ..args("0.0.0.0:0") });
+        let uname = rustix::system::uname();
+        let ready = format!("ready http://{}:", uname.nodename().to_string_lossy());
+        assert!(all.starts_with(&ready) && all.contains("?token=carrot") && !all.contains("anyone"), "{all}");
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("word");
+        let mut writer =
+            std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(&file).unwrap();
+        writer.write_all(b"carrot\n").unwrap();
+        let local = text(&WebArgs { token_file: Some(file.clone()), ..args("127.0.0.1:0") });
+        assert!(local.contains("?token=carrot"), "{local}");
+        assert!(local.ends_with(&format!(" --token-file {}\n", file.display())), "{local}");
+        let open = text(&WebArgs { open: true, ..args("0.0.0.0:0") });
         let warning = "anyone who can reach this address can watch; to restrict that: --token WORD";
         assert_eq!(open.lines().last(), Some(warning), "{open}");
-        let json = text(&WebOptions { json: true, ..options("127.0.0.1:0") });
+        let json = run(&args("127.0.0.1:0"), true).1;
         assert_eq!(json.lines().count(), 1, "{json}");
     }
 
-    /// A player that breaks down over what a viewer wants.
-    struct Broken;
+    /// A player that panics on any command.
+    struct BrokenPlayer;
 
-    impl Playback for Broken {
-        fn order(&self, order: Order) {
-            panic!("nobody can {order:?}");
+    impl Playback for BrokenPlayer {
+        fn command(&self, command: PlayerCommand) {
+            panic!("cannot {command:?}");
         }
 
         fn progress(&self) -> Progress {
-            let (position_s, length_s, rate) = (0.0, None, None);
-            Progress { position_s, length_s, rate, paused: true, over: false, lap: 0, telegrams: 0 }
+            Progress { paused: true, ..Progress::default() }
         }
     }
 
-    /// Hands on what is written.
-    struct Told(mpsc::Sender<String>);
+    /// Sends each write to a channel.
+    struct Lines(mpsc::Sender<String>);
 
-    impl Write for Told {
+    impl Write for Lines {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             let _ = self.0.send(String::from_utf8_lossy(bytes).into_owned());
             Ok(bytes.len())
@@ -254,32 +461,33 @@ mod tests {
         }
     }
 
-    /// Orders something of the server at `address`, as the page does.
-    fn order(address: &str) -> io::Result<TcpStream> {
+    /// Sends a command to the player of the server at `address`, as the page does.
+    fn send_command(address: &str) -> io::Result<TcpStream> {
         let mut viewer = TcpStream::connect(address)?;
         let upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
                        Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1";
         write!(viewer, "GET / HTTP/1.1\r\nHost: {address}\r\n{upgrade}\r\n\r\n")?;
-        let words = br#"{"op":"scanhub.player","order":"step"}"#;
-        // A text in one frame, masked by zeros.
-        viewer.write_all(&[&[0x81, 0x80 | words.len() as u8, 0, 0, 0, 0], &words[..]].concat())?;
+        let message = br#"{"op":"scanhub.player","order":"step"}"#;
+        // One text frame, with a mask of zeros.
+        viewer.write_all(&[&[0x81, 0x80 | message.len() as u8, 0, 0, 0, 0], &message[..]].concat())?;
         Ok(viewer)
     }
 
     #[test]
-    fn where_the_thread_that_serves_dies_the_verb_ends_and_says_so() {
-        let (tell, told) = mpsc::channel();
+    fn ends_with_a_failure_if_the_thread_of_the_server_panics() {
+        let (lines, received) = mpsc::channel();
         let stop = AtomicBool::new(false);
-        let (ordered, end) = thread::scope(|scope| {
-            let verb = scope.spawn(|| web(&options("127.0.0.1:0"), Some(&Broken), &mut Told(tell), &stop));
-            let ready = told.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
+        let (sent, end) = thread::scope(|scope| {
+            let verb = scope
+                .spawn(|| args("127.0.0.1:0").run(&[], false, Some(&BrokenPlayer), &mut Lines(lines), &stop));
+            let ready = received.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
             let address = ready.lines().next().unwrap_or_default();
-            let ordered = order(address.trim().trim_start_matches("ready http://").trim_end_matches('/'));
-            // Else it would serve on for ever.
-            stop.store(ordered.is_err(), Ordering::Relaxed);
-            (ordered, verb.join().unwrap())
+            let sent = send_command(address.trim().trim_start_matches("ready http://").trim_end_matches('/'));
+            // Otherwise the verb would not end.
+            stop.store(sent.is_err(), Ordering::Relaxed);
+            (sent, verb.join().unwrap())
         });
-        assert!(ordered.is_ok(), "{ordered:?}");
+        assert!(sent.is_ok(), "{sent:?}");
         let failure = end.unwrap_err();
         assert_eq!((failure.kind, &failure.message[..]), (Kind::Failed, "what serves the viewers ended"));
         assert_eq!(failure.hint, "start it again");
@@ -287,25 +495,57 @@ mod tests {
 
     #[test]
     fn urls_have_the_token_and_every_address() {
-        let names = ["robot".to_owned()];
         let reachable = ["192.168.1.7", "2001:db8::7"].map(|address| address.parse().unwrap());
-        let of =
-            |listen: &str, names: &[String], token| urls(listen.parse().unwrap(), &reachable, names, token);
-        assert_eq!(of("127.0.0.1:8080", &names, None), ["http://127.0.0.1:8080/"]);
-        assert_eq!(of("127.0.0.1:8080", &names, Some("carrot")), ["http://127.0.0.1:8080/?token=carrot"]);
-        assert_eq!(of("0.0.0.0:8080", &names, None), ["http://robot:8080/", "http://192.168.1.7:8080/"]);
+        let of = |listen: &str, host: &str, token| urls(listen.parse().unwrap(), &reachable, host, token);
+        assert_eq!(of("127.0.0.1:8080", "robot", None), ["http://127.0.0.1:8080/"]);
+        assert_eq!(of("127.0.0.1:8080", "robot", Some("carrot")), ["http://127.0.0.1:8080/?token=carrot"]);
+        assert_eq!(of("0.0.0.0:8080", "robot", None), ["http://robot:8080/", "http://192.168.1.7:8080/"]);
         let all = ["http://192.168.1.7:8080/?token=x", "http://[2001:db8::7]:8080/?token=x"];
-        assert_eq!(of("[::]:8080", &[], Some("x")), all);
-        assert_eq!(urls("0.0.0.0:8080".parse().unwrap(), &[], &[], None), ["http://0.0.0.0:8080/"]);
+        assert_eq!(of("[::]:8080", "", Some("x")), all);
+        assert_eq!(urls("0.0.0.0:8080".parse().unwrap(), &[], "", None), ["http://0.0.0.0:8080/"]);
     }
 
     #[test]
-    fn a_token_that_no_address_shows_is_refused() {
-        for token in ["", " ", "a&b", "a#b", "ö", "100%"] {
-            let stop = AtomicBool::new(true);
-            let options = WebOptions { token: Some(token.to_owned()), ..options("127.0.0.1:0") };
-            let failure = web(&options, None, &mut Vec::new(), &stop).unwrap_err();
-            assert_eq!(failure.kind, Kind::Usage, "{token:?}");
+    fn refuses_tokens_that_change_in_a_url() {
+        for text in ["", " ", "a&b", "a#b", "ö", "100%"] {
+            assert!(token(text).is_err(), "{text:?}");
+        }
+        assert_eq!(token("a-Z_0.~"), Ok("a-Z_0.~".to_owned()));
+    }
+
+    #[test]
+    fn listen_takes_a_port_an_address_or_both() {
+        for (text, expected) in [
+            ("8090", "127.0.0.1:8090"),
+            ("0", "127.0.0.1:0"),
+            (":8090", "127.0.0.1:8090"),
+            ("localhost:8090", "127.0.0.1:8090"),
+            ("localhost", "127.0.0.1:8080"),
+            ("0.0.0.0", "0.0.0.0:8080"),
+            ("::", "[::]:8080"),
+            ("[::]", "[::]:8080"),
+            ("::1", "[::1]:8080"),
+            ("192.168.1.7", "192.168.1.7:8080"),
+            ("0.0.0.0:8090", "0.0.0.0:8090"),
+            ("[::]:8090", "[::]:8090"),
+        ] {
+            assert_eq!(listen_address(text), Ok(expected.parse().unwrap()), "{text}");
+        }
+        for bad in [
+            "",
+            "65536",
+            "-1",
+            ":",
+            "localhost:",
+            "::8090x",
+            "robot",
+            "robot:8090",
+            "0.0.0.0:",
+            "1.2.3",
+            "[0.0.0.0",
+            "http://0.0.0.0",
+        ] {
+            assert!(listen_address(bad).is_err(), "{bad}");
         }
     }
 }

@@ -1,5 +1,5 @@
-//! What a slow viewer and a crowd cost those who read: nothing. Message by message: the next one is put up when all who read
-//! have the last one, so that each that they miss is seen, and it does not matter how fast the machine is.
+//! A slow viewer and many connections cost the other viewers no message. The next message is published once all readers have the
+//! last one, so the test does not depend on the speed of the machine.
 
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,17 +7,19 @@ use std::sync::mpsc;
 use std::thread;
 use std::time::Duration;
 
-use scanhub_viewer::server::{Board, Channel, ChannelId, Door, Event, Server, VIEWERS};
+use scanhub_viewer::server::{
+    AccessPolicy, Channel, ChannelPublisher, ChannelStore, Event, MAX_VIEWERS, Server,
+};
 use serde_json::json;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
 /// Far longer than a message takes.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// So many messages are more than the buffers of the system take.
+const TIMEOUT: Duration = Duration::from_secs(60);
+/// Number of messages; together they are longer than the buffers of the system.
 const MESSAGES: u32 = 400;
 const LENGTH: usize = 20_000;
-/// Of those who may look, so many read.
+/// Number of viewers that read.
 const READERS: usize = 16;
 
 fn channel(topic: &str, is_kept: bool) -> Channel {
@@ -35,7 +37,7 @@ fn view(address: SocketAddr) -> WebSocket<TcpStream> {
     let mut request = format!("ws://{address}/").into_client_request().unwrap();
     request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().unwrap());
     let stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     tungstenite::client(request, stream).unwrap().0
 }
 
@@ -48,7 +50,7 @@ fn next(viewer: &mut WebSocket<TcpStream>) -> (u32, Vec<u8>) {
     }
 }
 
-/// Subscribes to both channels, and waits until that is done: what is kept comes at once.
+/// Subscribes to both channels, and waits for the last state, which is sent at once.
 fn subscribe(viewer: &mut WebSocket<TcpStream>) {
     let both: Vec<_> = (1..=2).map(|id| json!({ "id": id, "channelId": id })).collect();
     let wish = json!({ "op": "subscribe", "subscriptions": both });
@@ -56,12 +58,12 @@ fn subscribe(viewer: &mut WebSocket<TcpStream>) {
     assert_eq!(next(viewer).0, 2);
 }
 
-/// Puts up message `number` of `scans`.
-fn put(board: &Board, scans: ChannelId, number: u32) {
+/// Publishes message `number` of `scans`.
+fn put(channels: &ChannelStore, scans: ChannelPublisher<'_>, number: u32) {
     let mut payload = vec![0; LENGTH];
     payload[..4].copy_from_slice(&number.to_le_bytes());
-    board.put(scans, 1, &payload);
-    board.tell();
+    scans.publish(1, &payload);
+    channels.wake_if_new();
 }
 
 /// The number of a message of subscription 1.
@@ -70,58 +72,58 @@ fn number((subscription, body): (u32, Vec<u8>)) -> u32 {
     u32::from_le_bytes(body[..4].try_into().unwrap())
 }
 
-/// Lets the server end, whatever becomes of this test.
-struct Close<'a>(&'a AtomicBool, &'a Board);
+/// Ends the server even if the test fails.
+struct Close<'a>(&'a AtomicBool, &'a ChannelStore);
 
 impl Drop for Close<'_> {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
-        self.1.ring();
+        self.1.wake();
     }
 }
 
 #[test]
-fn whoever_reads_gets_every_message_beside_one_who_does_not_and_a_crowd() {
-    let (board, stop) = (Board::new().unwrap(), AtomicBool::new(false));
-    let scans = board.channel(channel("/front/scan", false));
-    let status = board.channel(channel("/front/status", true));
-    board.put(status, 1, b"{}");
-    let server = Server::bind("127.0.0.1:0".parse().unwrap(), Door::default()).unwrap();
+fn readers_get_every_message_despite_a_slow_viewer_and_many_connections() {
+    let (channels, stop) = (ChannelStore::new().unwrap(), AtomicBool::new(false));
+    let scans = channels.open(channel("/front/scan", false));
+    let status = channels.open(channel("/front/status", true));
+    status.publish(1, b"{}");
+    let server = Server::bind("127.0.0.1:0".parse().unwrap(), AccessPolicy::default()).unwrap();
     let (tell, events) = mpsc::channel();
     thread::scope(|scope| {
-        let served = scope.spawn(|| server.run(&board, None, &tell, &stop));
-        let closing = Close(&stop, &board);
+        let served = scope.spawn(|| server.run(&channels, None, &tell, &stop));
+        let closing = Close(&stop, &channels);
         let mut slow = view(server.address());
         subscribe(&mut slow);
         let mut readers: Vec<_> = (0..READERS).map(|_| view(server.address())).collect();
         readers.iter_mut().for_each(subscribe);
-        let _rest: Vec<_> = (readers.len() + 1..VIEWERS).map(|_| view(server.address())).collect();
+        let _rest: Vec<_> = (readers.len() + 1..MAX_VIEWERS).map(|_| view(server.address())).collect();
         let _idle: Vec<_> = (0..150).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
         for sent in 1..=MESSAGES {
-            put(&board, scans, sent);
+            put(&channels, scans, sent);
             for reader in &mut readers {
                 assert_eq!(number(next(reader)), sent);
             }
         }
-        // He was slow indeed: what he is sent ends with the last message, and most of the others are not there.
+        // The slow viewer gets the last message, and misses most of the others.
         let mut got = vec![number(next(&mut slow))];
         while got.last() != Some(&MESSAGES) {
             got.push(number(next(&mut slow)));
         }
         assert!(got.is_sorted() && got.len() < MESSAGES as usize / 2, "{} of {MESSAGES}", got.len());
         drop((slow, readers));
-        let skipped = || events.recv_timeout(PATIENCE).unwrap();
+        let skipped = || events.recv_timeout(TIMEOUT).unwrap();
         let mut gone = Vec::new();
         while gone.len() <= READERS {
             if let Event::Viewer(visit) = skipped()
-                && !visit.came
+                && !visit.connected
             {
                 gone.push(visit.skipped);
             }
         }
         gone.sort_unstable();
         let told = gone.pop();
-        assert_eq!(told, Some(u64::from(MESSAGES) - got.len() as u64), "it is counted what he missed");
+        assert_eq!(told, Some(u64::from(MESSAGES) - got.len() as u64), "skipped messages are counted");
         assert!(gone.iter().all(|skipped| *skipped == 0), "{gone:?}");
         drop(closing);
         served.join().unwrap().unwrap();
@@ -129,21 +131,21 @@ fn whoever_reads_gets_every_message_beside_one_who_does_not_and_a_crowd() {
 }
 
 #[test]
-fn every_server_has_another_session() {
+fn every_server_has_its_own_session() {
     let sessions: Vec<_> = (0..2)
         .map(|_| {
-            let (board, stop) = (Board::new().unwrap(), AtomicBool::new(false));
-            let server = Server::bind("127.0.0.1:0".parse().unwrap(), Door::default()).unwrap();
+            let (channels, stop) = (ChannelStore::new().unwrap(), AtomicBool::new(false));
+            let server = Server::bind("127.0.0.1:0".parse().unwrap(), AccessPolicy::default()).unwrap();
             let (tell, _events) = mpsc::channel();
             thread::scope(|scope| {
-                scope.spawn(|| server.run(&board, None, &tell, &stop));
-                let _closing = Close(&stop, &board);
+                scope.spawn(|| server.run(&channels, None, &tell, &stop));
+                let _closing = Close(&stop, &channels);
                 let said = view(server.address()).read().unwrap().to_string();
                 let said: serde_json::Value = serde_json::from_str(&said).unwrap();
                 said["sessionId"].as_str().unwrap().to_owned()
             })
         })
         .collect();
-    // As many bits as no two have by chance.
+    // 128 random bits are never equal by chance.
     assert!(sessions[0] != sessions[1] && sessions.iter().all(|one| one.len() == 32), "{sessions:?}");
 }

@@ -239,7 +239,14 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
         ),
         (
             "scanhub-viewer",
-            &["scanhub-client", "scanhub-ros", "scanhub-schema", "scanhub-shm", "scanhub-verbs"],
+            &[
+                "scanhub-client",
+                "scanhub-files",
+                "scanhub-ros",
+                "scanhub-schema",
+                "scanhub-shm",
+                "scanhub-verbs",
+            ],
         ),
     ];
     knows_others(tree, &known)

@@ -17,7 +17,7 @@ pub struct Sensor {
     pub name: String,
     /// The last status of its link.
     pub status: Option<Status>,
-    /// Where the sensor is placed in the picture.
+    /// Position in the picture.
     pub placement: SensorPlacement,
     /// The last scan, unless it is too old.
     pub scan: Option<Box<Scan>>,
@@ -128,7 +128,7 @@ impl Sensor {
         (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }
 
-    /// Returns the state of the link in one word.
+    /// Returns the state of the link for people.
     pub fn state(&self) -> &'static str {
         match self.status.map(|status| status.state()) {
             None => "unheard",
@@ -190,7 +190,7 @@ impl Sensor {
     }
 }
 
-/// Where a sensor is placed in the picture.
+/// Position of a sensor in the picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum SensorPlacement {
     /// The pose is not known yet, so the sensor has no points.
@@ -295,12 +295,12 @@ impl RateMeter {
     }
 }
 
-/// Why something is missing in the picture, and the remedy.
+/// Reason why something is missing in the picture, and the remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Problem {
-    /// What is wrong.
+    /// Description of the problem.
     pub what: String,
-    /// What to do about it, often a command. May be empty.
+    /// Remedy, often a command. May be empty.
     pub remedy: String,
 }
 

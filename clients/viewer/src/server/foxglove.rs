@@ -1,16 +1,16 @@
-//! The wire of `foxglove.sdk.v1`: what server and viewers say over the WebSocket
-//! (<https://github.com/foxglove/ws-protocol>). Bytes in, bytes out; refuses to know sockets and what messages mean.
+//! Messages of the protocol `foxglove.sdk.v1` between server and viewers
+//! (<https://github.com/foxglove/ws-protocol>). No I/O.
 
 use serde::{Deserialize, Serialize};
 
-use crate::server::board::Channel;
-use crate::server::playback::Order;
+use super::channels::Channel;
+use super::player::PlayerCommand;
 
-/// The subprotocols of the WebSocket, the preferred one first. The second is the name of the first before Foxglove had an SDK;
-/// clients that know that name alone (npm's `@foxglove/ws-protocol`, older ones of Lichtblick) say and hear the same.
+/// Subprotocols of the WebSocket, the preferred one first. The second is the former name of the same protocol. Some clients
+/// only know that name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
 pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
-/// What the server says first.
+/// Returns the first message of the server.
 pub(crate) fn server_info(session: &str) -> String {
     text(&serde_json::json!({
         "op": "serverInfo",
@@ -21,7 +21,7 @@ pub(crate) fn server_info(session: &str) -> String {
     }))
 }
 
-/// Says which channels there are, by their numbers.
+/// Returns the message that advertises channels with their IDs.
 pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>) -> String {
     #[derive(Serialize)]
     #[serde(rename_all = "camelCase")]
@@ -46,20 +46,20 @@ pub(crate) fn advertise<'a>(channels: impl Iterator<Item = (usize, &'a Channel)>
     text(&serde_json::json!({ "op": "advertise", "channels": channels }))
 }
 
-/// There is no such channel.
+/// Returns the error for a subscription to a channel that does not exist.
 pub(crate) fn unknown_channel(at: usize) -> String {
     const ERROR: u8 = 2;
     let message = format!("Unknown channel ID: {}", at.wrapping_add(1));
     text(&serde_json::json!({ "op": "status", "level": ERROR, "message": message }))
 }
 
-/// A warning that viewers show until another one with this `id` comes.
+/// Returns a warning that viewers show until the next one with this `id`.
 pub(crate) fn warning(id: &str, message: &str) -> String {
     const WARNING: u8 = 1;
     text(&serde_json::json!({ "op": "status", "level": WARNING, "message": message, "id": id }))
 }
 
-/// A message of a subscription, of a moment in ns since 1970.
+/// Returns a message of a subscription with its time in ns since 1970.
 pub(crate) fn message(subscription: u32, wall_ns: u64, payload: &[u8]) -> Vec<u8> {
     const MESSAGE_DATA: u8 = 1;
     let mut frame = Vec::with_capacity(13 + payload.len());
@@ -70,22 +70,22 @@ pub(crate) fn message(subscription: u32, wall_ns: u64, payload: &[u8]) -> Vec<u8
     frame
 }
 
-/// What a viewer asks for.
+/// Message from a viewer.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Wish {
-    /// Messages of channels, each by the number of the subscription and of the channel's place.
+pub(crate) enum ClientMessage {
+    /// Subscribe to channels: ID of each subscription, and index of its channel.
     Subscribe(Vec<(u32, usize)>),
-    /// No more of these subscriptions.
+    /// End these subscriptions.
     Unsubscribe(Vec<u32>),
-    /// Something of the player, where there is one; this protocol's own players neither step nor double.
-    Player(Order),
+    /// Control the player. The protocol's own player messages have no step and no doubling.
+    Player(PlayerCommand),
 }
 
-/// What a viewer says; nothing if it is about what this server did not offer.
-pub(crate) fn parse(text: &str) -> Option<Wish> {
+/// Parses a message from a viewer. `None` if it is invalid, or about a capability that this server does not have.
+pub(crate) fn parse(text: &str) -> Option<ClientMessage> {
     #[derive(Deserialize)]
     #[serde(tag = "op", rename_all = "camelCase")]
-    enum Said {
+    enum Op {
         Subscribe {
             subscriptions: Vec<Subscription>,
         },
@@ -95,7 +95,7 @@ pub(crate) fn parse(text: &str) -> Option<Wish> {
         },
         #[serde(rename = "scanhub.player")]
         Player {
-            order: Order,
+            order: PlayerCommand,
         },
     }
     #[derive(Deserialize)]
@@ -105,13 +105,13 @@ pub(crate) fn parse(text: &str) -> Option<Wish> {
         channel_id: usize,
     }
     Some(match serde_json::from_str(text).ok()? {
-        Said::Subscribe { subscriptions } => {
-            // Channels are numbered from 1 on.
-            let place = |one: Subscription| (one.id, one.channel_id.wrapping_sub(1));
-            Wish::Subscribe(subscriptions.into_iter().map(place).collect())
+        Op::Subscribe { subscriptions } => {
+            // IDs of channels start at 1.
+            let index = |one: Subscription| (one.id, one.channel_id.wrapping_sub(1));
+            ClientMessage::Subscribe(subscriptions.into_iter().map(index).collect())
         }
-        Said::Unsubscribe { subscription_ids } => Wish::Unsubscribe(subscription_ids),
-        Said::Player { order } => Wish::Player(order),
+        Op::Unsubscribe { subscription_ids } => ClientMessage::Unsubscribe(subscription_ids),
+        Op::Player { order } => ClientMessage::Player(order),
     })
 }
 
@@ -124,23 +124,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_viewers_say_is_understood_and_all_else_is_nothing() {
+    fn parses_client_messages_and_ignores_others() {
         let subscribe =
             r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1},{"id":8,"channelId":0}]}"#;
-        assert_eq!(parse(subscribe), Some(Wish::Subscribe(vec![(7, 0), (8, usize::MAX)])));
+        assert_eq!(parse(subscribe), Some(ClientMessage::Subscribe(vec![(7, 0), (8, usize::MAX)])));
         let unsubscribe = r#"{"op":"unsubscribe","subscriptionIds":[7]}"#;
-        assert_eq!(parse(unsubscribe), Some(Wish::Unsubscribe(vec![7])));
+        assert_eq!(parse(unsubscribe), Some(ClientMessage::Unsubscribe(vec![7])));
         let step = r#"{"op":"scanhub.player","order":"step"}"#;
-        assert_eq!(parse(step), Some(Wish::Player(Order::Step)));
+        assert_eq!(parse(step), Some(ClientMessage::Player(PlayerCommand::Step)));
         let deep = "[".repeat(100_000);
         for other in ["", "{}", r#"{"op":"getParameters"}"#, r#"{"op":"subscribe"}"#, &deep] {
             assert_eq!(parse(other), None);
         }
     }
 
-    /// What PyPI's foxglove-sdk 0.30.3 said as a server, of the same channel and message.
+    /// The expected messages were recorded from a server of PyPI's foxglove-sdk 0.30.3, with the same channel and message.
     #[test]
-    fn foxgloves_own_server_says_the_same() {
+    fn sends_the_same_as_the_foxglove_sdk() {
         let channel = Channel {
             topic: "/front/status".into(),
             encoding: "json",
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_server_says_has_the_protocols_keys() {
+    fn server_messages_have_the_keys_of_the_protocol() {
         let channel = Channel {
             topic: "/front/scan".into(),
             encoding: "cdr",

@@ -1,84 +1,81 @@
-//! What a scene becomes on the wire: the channels, and the bytes of their messages. Scans and poses are ROS's, which every
-//! viewer draws; circles and marks are Foxglove's; states and the verdict are objects of JSON. Refuses to know viewers.
+//! Messages for viewers, made from a scene and from samples: the channels, and the bytes of their messages. Scans and poses
+//! have the types of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict are JSON objects.
 
-mod replay;
 mod scene_update;
-mod tilt;
 
-use crate::scene::{Problem, Scene, Sensor, rooms};
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
-use scanhub_schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
+use scanhub_schema::{Background, Counter, Header, Pose, Scan, ScanHead, Tilt, is_remote};
 use serde::Serialize;
 
-use crate::server::board::Channel;
+use super::channels::Channel;
+use crate::scene::{Problem, Scene, Sensor, rooms};
 
-pub use replay::{replay, replay_channel};
 pub use scene_update::{lines, marks, obstacles, tracks, zones};
-pub use tilt::{tilt, tilt_channel};
 
-/// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
+/// Returns the channel of a sensor's scans, as `sensor_msgs/msg/LaserScan`.
 pub fn scan_channel(sensor: &str) -> Channel {
     of_ros(scan_topic(sensor), LASER_SCAN, false)
 }
 
-/// What stands before the background of a sensor, as `sensor_msgs/msg/PointCloud2`.
+/// Returns the channel of a sensor's foreground, as `sensor_msgs/msg/PointCloud2`.
 pub fn foreground_channel(sensor: &str) -> Channel {
     of_ros(beside_scan(sensor, "foreground"), POINT_CLOUD, false)
 }
 
-/// The learned background of a sensor, as a `sensor_msgs/msg/LaserScan` that nobody measured.
+/// Returns the channel of a sensor's learned background, as `sensor_msgs/msg/LaserScan`.
 pub fn background_channel(sensor: &str) -> Channel {
     of_ros(beside_scan(sensor, "background"), LASER_SCAN, true)
 }
 
-/// Where the sensors sit, as `tf2_msgs/msg/TFMessage`.
+/// Returns the channel of the sensors' poses, as `tf2_msgs/msg/TFMessage`.
 pub fn transforms_channel() -> Channel {
     of_ros(TF_STATIC.to_owned(), TF_MESSAGE, true)
 }
 
-/// The circles around the robot, and the beams that violate them, as `foxglove.SceneUpdate`.
+/// Returns the channel of the circles around the robot and the beams that violate them, as `foxglove.SceneUpdate`.
 pub fn zones_channel() -> Channel {
     scene_update::channel("/zones")
 }
 
-/// Reflector marks, as `foxglove.SceneUpdate`.
+/// Returns the channel of the reflector marks, as `foxglove.SceneUpdate`.
 pub fn marks_channel() -> Channel {
     scene_update::channel("/marks")
 }
 
-/// The straight surfaces that the sensors see, and their corners, as `foxglove.SceneUpdate`.
+/// Returns the channel of line features and corners, as `foxglove.SceneUpdate`.
 pub fn lines_channel() -> Channel {
     scene_update::channel("/lines")
 }
 
-/// The people of `tracker` and their tails, as `foxglove.SceneUpdate`.
+/// Returns the channel of the people of `tracker` and their tails, as `foxglove.SceneUpdate`.
 pub fn tracks_channel(tracker: &str) -> Channel {
     scene_update::channel(&beside_scan(tracker, "tracks"))
 }
 
-/// The points of whole sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
+/// Returns the channel of the points of complete sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
 pub fn cloud_channel(name: &str) -> Channel {
     of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
 }
 
-/// What the last sweep has found, as `foxglove.SceneUpdate`. Not for who comes later: it holds from when it comes.
+/// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later subscribers, because
+/// a message is valid for a limited time after its arrival.
 pub fn obstacles_channel(name: &str) -> Channel {
     Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
 }
 
-/// The verdict and the hub, see [`robot`].
+/// Returns the channel of the verdict and the hub, see [`robot`].
 pub fn robot_channel() -> Channel {
-    json("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
+    json_channel("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
 }
 
-/// The state of a sensor, see [`status`].
+/// Returns the channel of a sensor's state, see [`status`].
 pub fn status_channel(sensor: &str) -> Channel {
-    json(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
+    json_channel(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
-/// The verdict of the robot's sensors, whether they are shown in a map, how its hub is, and how many people are in which room, in
-/// words; `trouble` is why there is no hub.
-pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Problem>) -> Vec<u8> {
+/// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of people in
+/// each room as text. `problem` is why there is no hub.
+pub fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
         verdict: &'a str,
@@ -94,7 +91,7 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Problem>) -> Vec<u8> 
         trouble: Option<Words<'a>>,
     }
     let (verdict, sensor, nearest_mm) = crate::scene::verdict(scene.robot().map(|(_, sensor)| sensor));
-    bytes(&Robot {
+    json_bytes(&Robot {
         verdict: verdict.name(),
         sensor,
         nearest_m: nearest_mm.map(|mm| f64::from(mm) / 1000.0),
@@ -105,11 +102,11 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Problem>) -> Vec<u8> 
         hub_words: hub_words(scene, domain),
         map: scene.is_in_map(),
         people: rooms(scene.people()),
-        trouble: trouble.map(Words::of),
+        trouble: problem.map(Words::of),
     })
 }
 
-/// How the hub is, in words.
+/// Returns the state of the hub as text.
 fn hub_words(scene: &Scene, domain: &str) -> String {
     if !scene.hub_lives {
         return "no hub".to_owned();
@@ -123,7 +120,7 @@ fn hub_words(scene: &Scene, domain: &str) -> String {
 /// or a recording.
 pub fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]
-    struct Told<'a> {
+    struct SensorState<'a> {
         name: &'a str,
         state: &'a str,
         family: Option<&'a str>,
@@ -164,8 +161,8 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
     };
     let status = sensor.status.as_ref();
     let ages = sensor.meter.age_percentiles_ms();
-    let trouble = sensor.problem();
-    bytes(&Told {
+    let problem = sensor.problem();
+    json_bytes(&SensorState {
         name: &sensor.name,
         state: sensor.state(),
         family: status.and_then(|status| status.family()).map(|family| family.name()),
@@ -189,15 +186,14 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         marks: sensor.marks.map(|marks| marks.marks().len()),
         verdict: sensor.zones.verdict().name(),
         nearest_m: sensor.zones.nearest().map(|(_, mm)| f64::from(mm) / 1000.0),
-        trouble: trouble.as_ref().map(Words::of),
+        trouble: problem.as_ref().map(Words::of),
     })
 }
 
-/// The background of `sensor` as the scan that it would be: nan where nothing is known, +inf where it is too far to see.
+/// Encodes the background of `sensor` as a scan: NaN where it is unknown, +inf where it is out of range.
 pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
-    const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
     let as_scan = |range: &u16| match *range {
-        Background::UNTAUGHT => NOT_MEASURED,
+        Background::UNTAUGHT => Scan::NOT_MEASURED,
         Background::FAR => BEYOND,
         range => range.min(BEYOND - 1),
     };
@@ -215,16 +211,33 @@ pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Bac
     scanhub_ros::laser_scan(message, scanhub_ros::frame(sensor), &header, &Scan::of(head, &ranges));
 }
 
-/// Stands for a range that no sensor measures.
+/// Value for ranges that are out of range.
 const BEYOND: u16 = u16::MAX - 1;
 
-/// Where the sensors of `scene` sit, as far as that was told.
+/// Encodes the poses of the sensors, as far as they are known.
 pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.placement.pose()?));
     let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
     let mut message = Vec::new();
     scanhub_ros::static_transforms(&mut message, wall_ns, &poses);
     message
+}
+
+/// Returns the channel of the angles of `mount`, see [`tilt`].
+pub fn tilt_channel(mount: &str) -> Channel {
+    let schema = include_str!("messages/tilt.json");
+    Channel { is_kept: false, ..json_channel(beside_scan(mount, "tilt"), "scanhub.Tilt", schema) }
+}
+
+/// Encodes the angle of a mount, and its rate if that is known.
+pub fn tilt(tilt: &Tilt) -> Vec<u8> {
+    #[derive(Serialize)]
+    struct Angle {
+        angle_deg: f64,
+        rate_deg_s: Option<f64>,
+    }
+    let rate_deg_s = tilt.rate_rad_s().map(f64::to_degrees);
+    json_bytes(&Angle { angle_deg: tilt.angle_rad.to_degrees(), rate_deg_s })
 }
 
 #[derive(Serialize)]
@@ -234,12 +247,12 @@ struct Words<'a> {
 }
 
 impl Words<'_> {
-    fn of(trouble: &Problem) -> Words<'_> {
-        Words { what: &trouble.what, remedy: &trouble.remedy }
+    fn of(problem: &Problem) -> Words<'_> {
+        Words { what: &problem.what, remedy: &problem.remedy }
     }
 }
 
-/// The topic `word` in the namespace of the sensor's scans.
+/// Returns the topic `word` in the namespace of the sensor's scans.
 fn beside_scan(sensor: &str, word: &str) -> String {
     let topic = scan_topic(sensor);
     format!("{}{word}", topic.strip_suffix("scan").unwrap_or(&topic))
@@ -257,11 +270,11 @@ fn of_ros(topic: String, kind: Type, is_kept: bool) -> Channel {
     }
 }
 
-fn json(topic: String, schema_name: &'static str, schema: &'static str) -> Channel {
+pub(super) fn json_channel(topic: String, schema_name: &'static str, schema: &'static str) -> Channel {
     Channel { topic, encoding: "json", schema_name, schema_encoding: "jsonschema", schema, is_kept: true }
 }
 
-fn bytes(value: &impl Serialize) -> Vec<u8> {
+pub(super) fn json_bytes(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec(value).unwrap_or_default()
 }
 
@@ -271,8 +284,10 @@ mod tests {
     use scanhub_ros::read;
     use scanhub_schema::BackgroundHead;
 
+    use crate::server::player;
+
     #[test]
-    fn a_background_is_a_scan_of_what_is_known() {
+    fn background_is_encoded_as_a_scan() {
         let head =
             BackgroundHead { first_angle: -1.0, step: 0.5, unit_um: 1000, ..BackgroundHead::default() };
         let model = Background::of(head, &[4000, Background::UNTAUGHT, Background::FAR]);
@@ -285,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_known_is_null_and_the_verdict_unknown() {
+    fn unknown_values_are_null() {
         let mut scene = Scene::default();
         let object = |bytes: Vec<u8>| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap();
         let told = object(robot(&scene, "default", None));
@@ -293,12 +308,12 @@ mod tests {
         assert_eq!((&told["hub_words"], &told["people"]), (&"no hub".into(), &serde_json::Value::Null));
         let told = object(status(scene.sensor("front")));
         assert_eq!((&told["state"], &told["hz"]), (&"unheard".into(), &serde_json::Value::Null));
-        assert_eq!(told["pose"], serde_json::Value::Null, "nobody told where it sits");
+        assert_eq!(told["pose"], serde_json::Value::Null, "its pose is unknown");
         assert_eq!(told["trouble"]["what"], "nothing was heard of it yet");
     }
 
     #[test]
-    fn a_hub_in_words() {
+    fn state_of_the_hub_as_text() {
         let mut scene = Scene { hub_lives: true, ..Scene::default() };
         assert_eq!(hub_words(&scene, "default"), "domain default");
         (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));
@@ -306,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn every_message_has_the_keys_that_its_schema_tells() {
+    fn messages_have_the_keys_of_their_schema() {
         let mut scene = Scene::default();
         scene.sensor("front");
         let keys = |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
@@ -317,8 +332,8 @@ mod tests {
             (marks_channel(), marks(&scene, 1)),
             (lines_channel(), lines(&scene, 1)),
             (tracks_channel("house"), tracks(&crate::scene::People::default(), 1)),
-            (replay_channel(), replay(&crate::server::Progress::default())),
-            (tilt_channel("mount"), tilt(&scanhub_schema::Tilt::default())),
+            (player::channel(), player::message(&player::Progress::default())),
+            (tilt_channel("mount"), tilt(&Tilt::default())),
             (obstacles_channel("hall"), obstacles(&Header::default(), &scanhub_schema::Obstacles::default())),
         ];
         for (channel, message) in pairs {

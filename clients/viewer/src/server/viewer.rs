@@ -8,20 +8,20 @@ use std::time::{Duration, Instant};
 use tungstenite::protocol::{Role, WebSocketConfig};
 use tungstenite::{Bytes, Error, Message, WebSocket};
 
-use crate::server::board::{Board, Queued};
-use crate::server::foxglove::{self, Wish};
-use crate::server::playback::Playback;
+use super::channels::{ChannelStore, Queued};
+use super::foxglove::{self, ClientMessage};
+use super::player::Playback;
 
 /// Maximum number of subscriptions of a viewer.
-const SUBSCRIPTIONS: usize = 256;
+const MAX_SUBSCRIPTIONS: usize = 256;
 /// Maximum length of a message from a viewer, in bytes: enough to subscribe to everything.
-const LONGEST: usize = 64 << 10;
+const MAX_MESSAGE_LEN: usize = 64 << 10;
 /// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other viewers.
-const HEARD: usize = 32;
+const BATCH_SIZE: usize = 32;
 /// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
 const PIECE: usize = 16 << 10;
 /// Send timeout. A viewer that does not accept a message in this time is disconnected.
-const PATIENCE: Duration = Duration::from_secs(30);
+const SEND_TIMEOUT: Duration = Duration::from_secs(30);
 /// Minimum interval between two reports of skipped messages.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -43,7 +43,7 @@ pub(crate) struct Viewer {
     /// The last subscription to an unknown channel, which was not refused yet.
     unknown: Option<usize>,
     /// Whether unread messages may be left, even if the socket receives nothing new.
-    hears_more: bool,
+    has_unread: bool,
 }
 
 struct Subscription {
@@ -64,7 +64,7 @@ struct Skipped {
 
 /// The viewer has disconnected, or has to be disconnected.
 #[derive(Debug)]
-pub(crate) struct Gone;
+pub(crate) struct Disconnected;
 
 impl Viewer {
     /// Creates a viewer after its handshake. `early` are the bytes that it sent after the handshake.
@@ -73,12 +73,12 @@ impl Viewer {
         early: Vec<u8>,
         session: &str,
         now: Instant,
-    ) -> Result<Viewer, Gone> {
+    ) -> Result<Viewer, Disconnected> {
         let config = WebSocketConfig::default()
             .read_buffer_size(4096)
             .write_buffer_size(2 * PIECE)
-            .max_message_size(Some(LONGEST))
-            .max_frame_size(Some(LONGEST));
+            .max_message_size(Some(MAX_MESSAGE_LEN))
+            .max_frame_size(Some(MAX_MESSAGE_LEN));
         let mut viewer = Viewer {
             socket: WebSocket::from_partially_read(stream, early, Role::Server, Some(config)),
             subscriptions: Vec::new(),
@@ -90,7 +90,7 @@ impl Viewer {
             reported: Skipped::default(),
             report_at: now,
             unknown: None,
-            hears_more: true,
+            has_unread: true,
         };
         viewer.send(Message::text(foxglove::server_info(session)), now)?;
         viewer.flush(now)?;
@@ -111,70 +111,81 @@ impl Viewer {
         self.skipped.by_viewer + self.skipped.by_server
     }
 
-    /// Returns whether [`hear`](Self::hear) may have left messages unread.
-    pub(crate) fn hears_more(&self) -> bool {
-        self.hears_more
+    /// Returns whether [`receive`](Self::receive) may have left messages unread.
+    pub(crate) fn has_unread_messages(&self) -> bool {
+        self.has_unread
     }
 
     /// Returns when the viewer next needs service even without input, such as for a timeout.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
-        let gives_up = self.pending.map(|since| since + PATIENCE);
+        let times_out = self.pending.map(|since| since + SEND_TIMEOUT);
         let reports = (self.skipped != self.reported).then_some(self.report_at);
-        let hears = self.hears_more.then(Instant::now);
-        gives_up.into_iter().chain(reports).chain(hears).min()
+        let reads = self.has_unread.then(Instant::now);
+        times_out.into_iter().chain(reports).chain(reads).min()
     }
 
-    /// Handles messages from the viewer, up to [`HEARD`].
-    pub(crate) fn hear(&mut self, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
-        self.hears_more = false;
-        for _ in 0..HEARD {
+    /// Handles messages from the viewer, up to [`BATCH_SIZE`].
+    pub(crate) fn receive(
+        &mut self,
+        channels: &ChannelStore,
+        player: Option<&dyn Playback>,
+    ) -> Result<(), Disconnected> {
+        self.has_unread = false;
+        for _ in 0..BATCH_SIZE {
             match self.socket.read() {
-                Ok(Message::Text(text)) => self.obey(foxglove::parse(&text), board, player)?,
-                Ok(Message::Close(_)) => return Err(Gone),
+                Ok(Message::Text(text)) => self.handle_message(foxglove::parse(&text), channels, player)?,
+                Ok(Message::Close(_)) => return Err(Disconnected),
                 Ok(_) => {}
                 Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
-                Err(_) => return Err(Gone),
+                Err(_) => return Err(Disconnected),
             }
         }
-        self.hears_more = true;
+        self.has_unread = true;
         Ok(())
     }
 
-    fn obey(&mut self, wish: Option<Wish>, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
-        match wish {
-            Some(Wish::Subscribe(wanted)) => {
+    fn handle_message(
+        &mut self,
+        message: Option<ClientMessage>,
+        channels: &ChannelStore,
+        player: Option<&dyn Playback>,
+    ) -> Result<(), Disconnected> {
+        match message {
+            Some(ClientMessage::Subscribe(wanted)) => {
                 for (id, channel) in wanted {
                     if self.subscriptions.iter().any(|one| one.id == id) {
                         continue;
                     }
-                    if self.subscriptions.len() >= SUBSCRIPTIONS {
-                        return Err(Gone);
+                    if self.subscriptions.len() >= MAX_SUBSCRIPTIONS {
+                        return Err(Disconnected);
                     }
-                    let Some(number) = board.subscribe(channel) else {
+                    let Some(number) = channels.subscribe(channel) else {
                         self.unknown = Some(channel);
                         continue;
                     };
                     self.subscriptions.push(Subscription { id, channel, number });
                 }
             }
-            Some(Wish::Unsubscribe(ids)) => {
+            Some(ClientMessage::Unsubscribe(ids)) => {
                 let (gone, left) = std::mem::take(&mut self.subscriptions)
                     .into_iter()
                     .partition(|one: &Subscription| ids.contains(&one.id));
                 self.subscriptions = left;
-                gone.iter().for_each(|one| board.unsubscribe(one.channel));
+                gone.iter().for_each(|one| channels.unsubscribe(one.channel));
             }
-            Some(Wish::Player(order)) => player.into_iter().for_each(|player| player.order(order)),
+            Some(ClientMessage::Player(command)) => {
+                player.into_iter().for_each(|player| player.command(command))
+            }
             None => {}
         }
         Ok(())
     }
 
-    /// Sends what the viewer has to get until the socket is full.
-    pub(crate) fn serve(&mut self, board: &Board, now: Instant) -> Result<(), Gone> {
+    /// Sends messages until there are no more, or the socket is full.
+    pub(crate) fn serve(&mut self, channels: &ChannelStore, now: Instant) -> Result<(), Disconnected> {
         self.flush(now)?;
         while !self.is_pending() {
-            if !self.gather(board, now)? {
+            if !self.gather(channels, now)? {
                 return Ok(());
             }
             self.flush(now)?;
@@ -183,15 +194,15 @@ impl Viewer {
     }
 
     /// Buffers about [`PIECE`] bytes for the viewer. Returns whether there are any.
-    fn gather(&mut self, board: &Board, now: Instant) -> Result<bool, Gone> {
+    fn gather(&mut self, channels: &ChannelStore, now: Instant) -> Result<bool, Disconnected> {
         let mut length = 0;
         while length < PIECE {
-            let channels = board.channels_from(self.advertised);
-            if !channels.is_empty() {
-                self.advertised += channels.len();
+            let new = channels.channels_from(self.advertised);
+            if !new.is_empty() {
+                self.advertised += new.len();
                 length += PIECE;
-                let told = foxglove::advertise(channels.iter().map(|(at, channel)| (*at, &**channel)));
-                self.send(Message::text(told), now)?;
+                let advertisement = foxglove::advertise(new.iter().map(|(at, channel)| (*at, &**channel)));
+                self.send(Message::text(advertisement), now)?;
             } else if let Some(channel) = self.unknown.take() {
                 length += PIECE;
                 self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
@@ -200,7 +211,7 @@ impl Viewer {
                 self.report_at = now + REPORT_INTERVAL;
                 length += PIECE;
                 self.send(Message::text(foxglove::warning("skipped", &self.skipped.text())), now)?;
-            } else if let Some((id, queued)) = self.choose(board) {
+            } else if let Some((id, queued)) = self.choose(channels) {
                 let frame = foxglove::message(id, queued.wall_ns, &queued.payload);
                 length += frame.len();
                 self.send(Message::Binary(Bytes::from(frame)), now)?;
@@ -212,12 +223,12 @@ impl Viewer {
     }
 
     /// Returns the next message and its subscription. Subscriptions take turns.
-    fn choose(&mut self, board: &Board) -> Option<(u32, Queued)> {
+    fn choose(&mut self, channels: &ChannelStore) -> Option<(u32, Queued)> {
         let count = self.subscriptions.len();
         for step in 0..count {
             let at = (self.next + step) % count;
             let subscription = &mut self.subscriptions[at];
-            let Some(queued) = board.next(subscription.channel, subscription.number) else { continue };
+            let Some(queued) = channels.next(subscription.channel, subscription.number) else { continue };
             if !queued.is_kept {
                 let skipped = queued.number - subscription.number - 1;
                 let Skipped { by_viewer, by_server } = &mut self.skipped;
@@ -232,29 +243,29 @@ impl Viewer {
     }
 
     /// Buffers `message`, and may send some of the buffer.
-    fn send(&mut self, message: Message, now: Instant) -> Result<(), Gone> {
+    fn send(&mut self, message: Message, now: Instant) -> Result<(), Disconnected> {
         match self.socket.write(message) {
-            Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Gone),
+            Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Disconnected),
             Ok(()) | Err(Error::Io(_)) => {}
-            Err(_) => return Err(Gone),
+            Err(_) => return Err(Disconnected),
         }
         self.pending.get_or_insert(now);
         Ok(())
     }
 
-    fn flush(&mut self, now: Instant) -> Result<(), Gone> {
+    fn flush(&mut self, now: Instant) -> Result<(), Disconnected> {
         let Some(since) = self.pending else { return Ok(()) };
         match self.socket.flush() {
             Ok(()) => self.pending = None,
             Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => self.was_full = true,
-            Err(_) => return Err(Gone),
+            Err(_) => return Err(Disconnected),
         }
-        if self.is_pending() && now - since >= PATIENCE { Err(Gone) } else { Ok(()) }
+        if self.is_pending() && now - since >= SEND_TIMEOUT { Err(Disconnected) } else { Ok(()) }
     }
 
     /// Ends the subscriptions.
-    pub(crate) fn leave(&mut self, board: &Board) {
-        self.subscriptions.drain(..).for_each(|one| board.unsubscribe(one.channel));
+    pub(crate) fn unsubscribe_all(&mut self, channels: &ChannelStore) {
+        self.subscriptions.drain(..).for_each(|one| channels.unsubscribe(one.channel));
     }
 }
 
@@ -276,7 +287,7 @@ impl Skipped {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::server::board::Channel;
+    use crate::server::Channel;
     use std::net::TcpListener;
 
     /// Returns both ends of a viewer's connection.
@@ -291,9 +302,9 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_viewer_gets_the_newest_message_and_a_report_of_the_skipped_ones() {
-        let (board, now) = (Board::new().unwrap(), Instant::now());
-        let scans = board.channel(Channel {
+    fn slow_viewer_gets_the_newest_message_and_a_report_of_skipped_ones() {
+        let (channels, now) = (ChannelStore::new().unwrap(), Instant::now());
+        let scans = channels.open(Channel {
             topic: "/front/scan".into(),
             encoding: "cdr",
             schema_name: "S",
@@ -304,11 +315,11 @@ mod tests {
         let (mut viewer, mut client) = pair(now);
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
         client.send(Message::text(subscribe)).unwrap();
-        while !board.is_wanted(scans) {
-            viewer.hear(&board, None).unwrap();
+        while !scans.is_wanted() {
+            viewer.receive(&channels, None).unwrap();
         }
-        let put = |number: u32| {
-            board.put(scans, 1, &[&number.to_le_bytes()[..], &[0; 100_000]].concat());
+        let publish = |number: u32| {
+            scans.publish(1, &[&number.to_le_bytes()[..], &[0; 100_000]].concat());
         };
         let mut receive = || match client.read().unwrap() {
             Message::Binary(frame) => Ok(u32::from_le_bytes(frame[13..17].try_into().unwrap())),
@@ -316,8 +327,8 @@ mod tests {
             other => panic!("{other:?}"),
         };
         // The server is late, and the queue is too short.
-        (1..=40).for_each(put);
-        viewer.serve(&board, now).unwrap();
+        (1..=40).for_each(publish);
+        viewer.serve(&channels, now).unwrap();
         let (newest, report) = loop {
             match receive() {
                 Ok(number) => break (number, receive().unwrap_err()),
@@ -330,17 +341,17 @@ mod tests {
         let (mut last, now) = (40, now + REPORT_INTERVAL);
         while !viewer.is_pending() {
             last += 1;
-            put(last);
-            viewer.serve(&board, now).unwrap();
+            publish(last);
+            viewer.serve(&channels, now).unwrap();
         }
         for _ in 0..40 {
             last += 1;
-            put(last);
-            viewer.serve(&board, now).unwrap();
+            publish(last);
+            viewer.serve(&channels, now).unwrap();
         }
         let (mut numbers, mut report) = (vec![newest], String::new());
         while report.is_empty() || numbers.last() != Some(&last) {
-            viewer.serve(&board, now).unwrap();
+            viewer.serve(&channels, now).unwrap();
             match receive() {
                 Ok(number) => numbers.push(number),
                 Err(text) => report = text,
@@ -353,9 +364,9 @@ mod tests {
         // A viewer that never reads is disconnected.
         while !viewer.is_pending() {
             last += 1;
-            put(last);
-            viewer.serve(&board, now).unwrap();
+            publish(last);
+            viewer.serve(&channels, now).unwrap();
         }
-        assert!(viewer.serve(&board, now + PATIENCE).is_err());
+        assert!(viewer.serve(&channels, now + SEND_TIMEOUT).is_err());
     }
 }

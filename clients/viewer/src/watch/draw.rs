@@ -1,5 +1,5 @@
-//! Draws a scene: the verdict in words, the picture, a line per sensor, and the keys. Pure: the same scene and view
-//! give the same cells. Refuses to know what is on the screen.
+//! Draws a scene: the verdict as text, the picture or the counters, a line per sensor, and the keys. The same scene and view give
+//! the same cells.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -7,43 +7,41 @@ use ratatui::style::{Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Paragraph};
 
-use scanhub_schema::Counter;
+use scanhub_schema::{Counter, Status};
 
-use super::counters::page;
-use super::map::{DOTS, colour, map};
+use super::map::{DOTS, color, map};
 use super::view::View;
 use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
-/// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
+/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`, but verdict and sensors are always those of `scene`.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let places = Places::of(frame.area(), scene);
     let heading = heading(scene, view, places.heading.width);
-    if let Some(over) =
-        over(scene).into_iter().find(|over| heading.width() + over.width() <= width(places.heading))
-    {
-        let place = right(places.heading, over.width());
-        frame.render_widget(over, place);
+    let fits = |hub: &Line<'_>| heading.width() + hub.width() <= width(places.heading);
+    if let Some(hub) = hub_states(scene).into_iter().find(fits) {
+        let place = right(places.heading, hub.width());
+        frame.render_widget(hub, place);
     }
     frame.render_widget(heading, places.heading);
     let pictured = held.unwrap_or(scene);
     if view.counters {
-        frame.render_widget(Paragraph::new(page(&view.shown(scene), places.map)), places.map);
+        frame.render_widget(Paragraph::new(counters(&view.shown(scene), places.map)), places.map);
     } else {
         frame.render_widget(map(pictured, view, (places.map.width, places.map.height)), places.map);
-        let measure = measure(view.dot_m);
-        let room = width(places.map).saturating_sub(measure.chars().count() + 2);
-        let said = words(pictured, view, room);
-        let place = right(last_row(places.map), said.chars().count());
-        frame.render_widget(Line::raw(measure), last_row(places.map));
-        frame.render_widget(Line::raw(said), place);
+        let scale_bar = scale_bar(view.dot_m);
+        let room = width(places.map).saturating_sub(scale_bar.chars().count() + 2);
+        let text = pointer_text(pictured, view, room);
+        let place = right(last_row(places.map), text.chars().count());
+        frame.render_widget(Line::raw(scale_bar), last_row(places.map));
+        frame.render_widget(Line::raw(text), place);
     }
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
     }
-    let keys = match (view.news.as_str(), view.note.as_str()) {
+    let keys = match (view.message.as_str(), view.note.as_str()) {
         ("", "") => Line::raw(KEYS),
         ("", note) => Line::raw(format!("{FEW_KEYS}  {note}")),
-        (news, _) => Line::raw(news.to_owned()),
+        (message, _) => Line::raw(message.to_owned()),
     };
     frame.render_widget(keys.patch_style(Modifier::DIM), places.keys);
     if view.help {
@@ -51,12 +49,12 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, v
     }
 }
 
-/// Where the picture is on a screen of `area`.
-pub(crate) fn place_of_map(area: Rect, scene: &Scene) -> Rect {
+/// Returns the area of the picture on a screen of `area`.
+pub(super) fn map_area(area: Rect, scene: &Scene) -> Rect {
     Places::of(area, scene).map
 }
 
-/// Where things are on the screen.
+/// Areas of the screen.
 struct Places {
     heading: Rect,
     map: Rect,
@@ -70,7 +68,7 @@ impl Places {
             let y = area.y + from.min(area.height);
             Rect { y, height: rows.min(area.bottom() - y), ..area }
         };
-        // The picture comes first: on a low screen not all sensors have a line.
+        // The picture has priority, so on a small screen not every sensor has a line.
         let wanted = u16::try_from(scene.sensors.len()).unwrap_or(u16::MAX);
         let sensors = wanted.min(area.height / 4);
         let map = area.height.saturating_sub(2 + sensors);
@@ -83,21 +81,21 @@ impl Places {
     }
 }
 
-/// The verdict, and what is nearest; in words, because colours say nothing to everybody. What has no room is left out whole:
-/// a number that is cut is another number.
+/// Returns the verdict and the smallest distance as text, because not everyone can tell colors apart. A part that does not fit is
+/// omitted completely, because a truncated number is another number.
 fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     let shown = view.shown(scene);
-    let (verdict, whose, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
+    let (verdict, sensor, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
     let mut style = Style::new().add_modifier(Modifier::BOLD | Modifier::REVERSED);
-    if view.colours {
-        style = style.fg(colour(verdict));
+    if view.colors {
+        style = style.fg(color(verdict));
     }
     let mut spans = vec![Span::styled(format!(" {} ", verdict.name().to_uppercase()), style)];
     if view.paused {
         spans.push(Span::styled(" HELD ", Modifier::REVERSED));
     }
-    if let Some(whose) = whose {
-        spans.push(Span::raw(format!(" {whose}")));
+    if let Some(sensor) = sensor {
+        spans.push(Span::raw(format!(" {sensor}")));
     }
     if let Some(mm) = nearest {
         spans.push(Span::raw(format!(", nearest {:.2} m", f64::from(mm) / 1000.0)));
@@ -111,8 +109,8 @@ fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     Line::from(spans)
 }
 
-/// How the hub is, the longest words first.
-fn over(scene: &Scene) -> Vec<Line<'static>> {
+/// Returns the state of the hub as text, the longest form first.
+fn hub_states(scene: &Scene) -> Vec<Line<'static>> {
     let percent = scene.hub_percent.map(|percent| format!(" {percent:.1} %")).unwrap_or_default();
     let words = match (scene.hub_lives, scene.hub_pid) {
         (false, _) => {
@@ -126,19 +124,19 @@ fn over(scene: &Scene) -> Vec<Line<'static>> {
     words.into_iter().map(Line::raw).collect()
 }
 
-/// The sensors that have a line in `rows`: all, or those from the chosen one on.
+/// Returns the sensors that have a line in `rows`: all, or those from the selected one on.
 fn listed<'a>(scene: &'a Scene, view: &View, rows: u16) -> impl Iterator<Item = (usize, &'a Sensor)> {
     let hidden = scene.sensors.len().saturating_sub(usize::from(rows));
     let first = view.only.unwrap_or(0).min(hidden);
     scene.sensors.iter().enumerate().skip(first)
 }
 
-/// A sensor in a line, the most needed first: what has no room on a narrow screen is left out whole.
+/// Returns the line of a sensor, the most important first. A part that does not fit is omitted completely.
 fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static> {
     let dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
     let hz = dash(sensor.meter.hz().map(|hz| format!("{hz:.1}")));
     let age = dash(sensor.meter.age_ms().map(|(mean, _)| format!("{mean:.2}")));
-    let greatest = dash(sensor.meter.age_ms().map(|(_, greatest)| format!("{greatest:.2}")));
+    let max_age = dash(sensor.meter.age_ms().map(|(_, max)| format!("{max:.2}")));
     let mut text = format!("{} {:<8} {:<9}", number + 1, sensor.name, sensor.state());
     let loss = sensor.status.and_then(|status| status.line_loss());
     let error = sensor.status.map(|status| status.last_error().to_owned()).unwrap_or_default();
@@ -153,12 +151,12 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
         fields.push(format!("  suspect {}", sensor.count(Counter::Suspect)));
         if width >= WIDE {
-            let taught = sensor.background.as_ref().map_or(0, |model| model.taught);
+            let known_beams = sensor.background.as_ref().map_or(0, |model| model.taught);
             let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
             let objects =
                 sensor.foreground.as_ref().map(|foreground| foreground.segments().len().to_string());
-            fields.extend([format!("  max {greatest} ms"), format!("  marks {}", dash(marks))]);
-            fields.extend([format!("  objects {}", dash(objects)), format!("  background {taught}")]);
+            fields.extend([format!("  max {max_age} ms"), format!("  marks {}", dash(marks))]);
+            fields.extend([format!("  objects {}", dash(objects)), format!("  background {known_beams}")]);
         }
         for field in fields {
             if text.chars().count() + field.chars().count() > usize::from(width) {
@@ -175,22 +173,60 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     Line::styled(text, style)
 }
 
-/// A length of the picture that is easily compared: `|----| 1 m`.
-fn measure(dot_m: f64) -> String {
+/// Returns the counters of the links for `area`: a heading, the shares of the line, and all counters, with a column for each of the
+/// `shown` sensors. Columns and rows that do not fit are omitted.
+fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
+    let room = usize::from(area.width).saturating_sub(NAME_WIDTH) / COLUMN_WIDTH;
+    let columns = &shown[..shown.len().min(room)];
+    let row = |name: &str, value: &dyn Fn(&Sensor) -> String| {
+        let cells = columns.iter().map(|(_, sensor)| format!("{:>COLUMN_WIDTH$}", value(sensor)));
+        format!("{name:<NAME_WIDTH$}{}", cells.collect::<String>())
+    };
+    let of = |sensor: &Sensor, value: &dyn Fn(&Status) -> Option<String>| {
+        sensor.status.as_ref().and_then(value).unwrap_or_else(|| "-".to_owned())
+    };
+    let percent = |share: f64| format!("{:.2} %", 100.0 * share);
+    let mut lines = vec![Line::styled(row("", &|sensor| short(&sensor.name)), Modifier::BOLD)];
+    let shares = [
+        row("damaged on the line, last 10 s", &|sensor| {
+            of(sensor, &|status| Some(percent(status.damaged())))
+        }),
+        row("lost on the line, last 10 s", &|sensor| of(sensor, &|status| status.lost_share().map(percent))),
+        row("scans this program missed", &|sensor| sensor.lost.to_string()),
+    ];
+    lines.extend(shares.map(Line::raw));
+    // The last line has the scale bar.
+    let rows = usize::from(area.height).saturating_sub(lines.len() + 1);
+    lines.extend(Counter::ALL.iter().take(rows).map(|counter| {
+        let value = |status: &Status| Some(status.counters[*counter].to_string());
+        Line::raw(row(counter.name(), &|sensor| of(sensor, &value)))
+    }));
+    lines
+}
+
+/// Returns the end of a name that fits in a column. It distinguishes the sensors of one machine.
+fn short(name: &str) -> String {
+    let excess = name.chars().count().saturating_sub(COLUMN_WIDTH - 1);
+    name.chars().skip(excess).collect()
+}
+
+/// Returns a scale bar with a round length: `|----| 1 m`.
+fn scale_bar(dot_m: f64) -> String {
     let cell_m = dot_m * DOTS.0;
-    let length = LENGTHS_M.into_iter().rev().find(|length| length / cell_m <= MEASURE_CELLS);
+    let length = LENGTHS_M.into_iter().rev().find(|length| length / cell_m <= SCALE_BAR_CELLS);
     let length = length.unwrap_or(LENGTHS_M[0]);
-    let cells = (length / cell_m).round().clamp(2.0, 4.0 * MEASURE_CELLS) as usize;
+    let cells = (length / cell_m).round().clamp(2.0, 4.0 * SCALE_BAR_CELLS) as usize;
     format!("|{}| {length} m", "-".repeat(cells - 2))
 }
 
-/// What is under the pointer, if there is one, in at most `room` columns; what has no room is left out whole.
-fn words(scene: &Scene, view: &View, room: usize) -> String {
+/// Returns the text about the position of the pointer in at most `room` columns, or no text without a pointer. A part that does not fit is
+/// omitted completely.
+fn pointer_text(scene: &Scene, view: &View, room: usize) -> String {
     let Some(at) = view.pointer_m else { return String::new() };
     let shown = view.shown(scene);
-    let place = PointerPosition::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
+    let position = PointerPosition::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
     let mut words = String::new();
-    for part in place.words() {
+    for part in position.words() {
         let between = if words.is_empty() { "" } else { ", " };
         if words.chars().count() + between.len() + part.chars().count() > room {
             break;
@@ -228,7 +264,7 @@ fn last_row(area: Rect) -> Rect {
 const FEW_KEYS: &str = "q quit  ? help";
 const KEYS: &str = "q quit  ? help  +- zoom  x read  n counters  space freeze";
 
-/// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.
+/// Meaning of keys and signs, in at most 60 columns and 16 rows.
 const HELP: &str = "\
 + - wheel, hjkl, c    zoom, pan, fit
 tab  0 1 2 ..         next sensor, all, one of them
@@ -244,22 +280,26 @@ o ,   foreground, its trail (coloured: without the signs)
 * @   reflector mark, corner   ^ 1 2 robot, sensors
 0.60! circle around the robot, in m, with something inside";
 
-/// A point so near to the pointer is read.
+/// Width of the names of counters.
+const NAME_WIDTH: usize = 32;
+/// Width of the column of a sensor.
+const COLUMN_WIDTH: usize = 14;
+/// Maximum distance of a point from the pointer that is read, in dots.
 const NEAR_DOTS: f64 = 6.0;
-/// Columns from which a sensor's line says more.
+/// Columns from which on the line of a sensor has more fields.
 const WIDE: u16 = 100;
 const LENGTHS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
-/// The longest measure.
-const MEASURE_CELLS: f64 = 12.0;
+/// Maximum length of the scale bar, in cells.
+const SCALE_BAR_CELLS: f64 = 12.0;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn measures_are_round_and_short() {
-        assert_eq!(measure(0.05), "|--------| 1 m");
-        assert_eq!(measure(0.001), "|".to_owned() + &"-".repeat(48).as_str()[..46] + "| 0.1 m");
-        assert_eq!(measure(1.0), "|--------| 20 m");
+    fn scale_bars_are_round_and_short() {
+        assert_eq!(scale_bar(0.05), "|--------| 1 m");
+        assert_eq!(scale_bar(0.001), "|".to_owned() + &"-".repeat(48).as_str()[..46] + "| 0.1 m");
+        assert_eq!(scale_bar(1.0), "|--------| 20 m");
     }
 }

@@ -1,8 +1,5 @@
-//! The robot from above: what its sensors see, as Braille dots; ahead is up. Without colours, another sign replaces
-//! each colour.
-
-#[cfg(all(test, feature = "web"))]
-mod same;
+//! The robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each color is replaced by
+//! another sign.
 
 use ratatui::style::Color;
 use ratatui::symbols::Marker;
@@ -14,15 +11,15 @@ use scanhub_schema::Verdict;
 use super::view::View;
 use crate::scene::{Scene, circles};
 
-/// Dots of a cell of the terminal.
-pub(crate) const DOTS: (f64, f64) = (2.0, 4.0);
+/// Dots across and down in a cell of the terminal.
+pub(super) const DOTS: (f64, f64) = (2.0, 4.0);
 
-/// The picture of `scene` for `cells`, columns and rows.
-pub(crate) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'static, impl Fn(&mut Context)> {
-    // Ends of the axes are dots, not edges of them.
+/// Returns the picture of `scene` for `cells`, columns and rows.
+pub(super) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'static, impl Fn(&mut Context)> {
+    // The ends of the axes are the centers of dots, not their edges.
     let half = |cells: u16, dots: f64| view.dot_m * (f64::from(cells) * dots - 1.0).max(1.0) / 2.0;
     let (aside, ahead) = (half(cells.0, DOTS.0), half(cells.1, DOTS.1));
-    let (up, right) = (view.centre_m.0, -view.centre_m.1);
+    let (up, right) = (view.center_m.0, -view.center_m.1);
     let (x, y) = ([right - aside, right + aside], [up - ahead, up + ahead]);
     let mut layers = Layers::new(scene, view);
     if view.grid {
@@ -36,8 +33,8 @@ pub(crate) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'stat
         .paint(move |context| layers.paint(context))
 }
 
-/// The colour of a verdict, in the palette that the terminal's user chose.
-pub(crate) fn colour(verdict: Verdict) -> Color {
+/// Returns the color of a verdict, in the palette of the terminal.
+pub(super) fn color(verdict: Verdict) -> Color {
     match verdict {
         Verdict::Clear => Color::Green,
         Verdict::Slow => Color::Yellow,
@@ -45,10 +42,10 @@ pub(crate) fn colour(verdict: Verdict) -> Color {
     }
 }
 
-/// Points as the canvas has them: to the right, and up.
+/// Points in the coordinates of the canvas: to the right, and up.
 type Dots = Vec<(f64, f64)>;
 
-/// The ends of both axes, and what lies between them.
+/// Ends of both axes, and the cells between them.
 struct Grid {
     x: [f64; 2],
     y: [f64; 2],
@@ -57,8 +54,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// The place at which a sign gets into the cell that has the dot of `point`: the canvas spreads signs and dots over its
-    /// axes apart from each other.
+    /// Returns the position at which a sign is drawn in the cell of the point's dot. The canvas maps signs and dots to its axes in
+    /// different ways.
     fn cell(&self, (x, y): (f64, f64)) -> (f64, f64) {
         let cell = |from_m: f64, dots: f64, cells: u16, length: f64| {
             let cell = ((from_m / self.dot_m).round() / dots).floor() + 0.25;
@@ -74,12 +71,14 @@ impl Grid {
     }
 }
 
+/// Everything that is drawn, in canvas coordinates.
+#[derive(Default)]
 struct Layers {
-    colours: bool,
+    colors: bool,
     robot: Option<(f64, f64)>,
     background: Dots,
     circles: Vec<Circle>,
-    /// Where beams ended, by how much came back.
+    /// Points without foreground, by intensity.
     walls: [Dots; SHADES.len()],
     trails: Dots,
     foreground: Dots,
@@ -89,18 +88,19 @@ struct Layers {
     axes: Dots,
     pointer: Option<(f64, f64)>,
     marks: Dots,
-    /// Sensors by their numbers from 1.
+    /// Positions of sensors, and their numbers from 1.
     sensors: Vec<(f64, f64, String)>,
-    /// Where people were, and where they are, by their numbers; in brackets who is not seen.
+    /// Positions of people over the last seconds.
     tails: Dots,
+    /// Positions of people, and their IDs; in parentheses if they are not seen.
     people: Vec<(f64, f64, String)>,
 }
 
 struct Circle {
     dots: Dots,
-    /// Where it stands, and what it says.
+    /// Position and text.
     label: Option<(f64, f64, String)>,
-    colour: Color,
+    color: Color,
 }
 
 impl Layers {
@@ -108,22 +108,11 @@ impl Layers {
         let shown = view.shown(scene);
         let around = if view.zones { circles(shown.iter().map(|(_, sensor)| *sensor)) } else { Vec::new() };
         let mut layers = Layers {
-            colours: view.colours,
+            colors: view.colors,
             robot: (!scene.is_in_map()).then_some((0.0, 0.0)),
-            background: Vec::new(),
             circles: around.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
-            walls: Default::default(),
-            trails: Vec::new(),
-            foreground: Vec::new(),
-            lines: Vec::new(),
-            corners: Vec::new(),
-            grid: Vec::new(),
-            axes: Vec::new(),
             pointer: view.pointer_m.map(turned),
-            marks: Vec::new(),
-            sensors: Vec::new(),
-            tails: Vec::new(),
-            people: Vec::new(),
+            ..Layers::default()
         };
         for person in scene.people() {
             if view.trails {
@@ -163,7 +152,7 @@ impl Layers {
         layers
     }
 
-    /// Draws crossings of a grid in metres and dotted axes, from `x` to `y`.
+    /// Adds the crossings of a grid in meters, and dotted axes, in the bounds `x` and `y`.
     fn rule(&mut self, x: [f64; 2], y: [f64; 2], dot_m: f64) {
         let step = grid_step_m(dot_m);
         let ticks = |[from, to]: [f64; 2], step: f64| {
@@ -176,14 +165,14 @@ impl Layers {
         self.axes.extend(ticks(y, dots).map(|up| (0.0, up)));
     }
 
-    /// Moves signs to where the cells of `grid` are.
+    /// Moves signs to the cells of `grid`.
     fn snap(&mut self, grid: &Grid) {
         let snap = |dots: &mut Dots| {
             dots.retain(|dot| grid.has(*dot));
             dots.iter_mut().for_each(|dot| *dot = grid.cell(*dot));
         };
         [&mut self.marks, &mut self.corners, &mut self.grid].into_iter().for_each(snap);
-        if !self.colours {
+        if !self.colors {
             let signs = [
                 &mut self.background,
                 &mut self.foreground,
@@ -206,52 +195,52 @@ impl Layers {
     }
 
     fn paint(&self, context: &mut Context) {
-        let colour = |colour| if self.colours { colour } else { Color::Reset };
+        let ink = |color| if self.colors { color } else { Color::Reset };
         let draw = |context: &mut Context, coords: &Dots, color| context.draw(&Points { coords, color });
-        if !self.colours {
+        if !self.colors {
             context.marker(Marker::Custom(':'));
         }
-        draw(context, &self.axes, colour(Color::DarkGray));
+        draw(context, &self.axes, ink(Color::DarkGray));
         context.marker(Marker::Custom('+'));
-        draw(context, &self.grid, colour(Color::DarkGray));
-        context.marker(if self.colours { Marker::Braille } else { Marker::Custom('.') });
-        draw(context, &self.background, colour(Color::DarkGray));
+        draw(context, &self.grid, ink(Color::DarkGray));
+        context.marker(if self.colors { Marker::Braille } else { Marker::Custom('.') });
+        draw(context, &self.background, ink(Color::DarkGray));
         context.marker(Marker::Braille);
         for circle in &self.circles {
-            draw(context, &circle.dots, colour(circle.colour));
+            draw(context, &circle.dots, ink(circle.color));
         }
-        for (walls, ink) in self.walls.iter().zip(SHADES) {
-            draw(context, walls, colour(ink));
+        for (walls, shade) in self.walls.iter().zip(SHADES) {
+            draw(context, walls, ink(shade));
         }
-        draw(context, &self.lines, colour(Color::LightBlue));
-        if !self.colours {
+        draw(context, &self.lines, ink(Color::LightBlue));
+        if !self.colors {
             context.marker(Marker::Custom(','));
         }
-        draw(context, &self.trails, colour(Color::Magenta));
-        draw(context, &self.tails, colour(Color::LightGreen));
-        if !self.colours {
+        draw(context, &self.trails, ink(Color::Magenta));
+        draw(context, &self.tails, ink(Color::LightGreen));
+        if !self.colors {
             context.marker(Marker::Custom('o'));
         }
-        draw(context, &self.foreground, colour(Color::LightMagenta));
+        draw(context, &self.foreground, ink(Color::LightMagenta));
         context.marker(Marker::Custom('@'));
-        draw(context, &self.corners, colour(Color::LightBlue));
+        draw(context, &self.corners, ink(Color::LightBlue));
         context.marker(Marker::Custom('*'));
-        draw(context, &self.marks, colour(Color::Cyan));
-        // Labels take over the colour of what is below them, unless they have one.
-        let mut print = |x, y, label: &str, ink| context.print(x, y, Line::styled(label.to_owned(), ink));
+        draw(context, &self.marks, ink(Color::Cyan));
+        // A label has the color of the dots below it, unless it has its own.
+        let mut print = |x, y, label: &str, color| context.print(x, y, Line::styled(label.to_owned(), color));
         if let Some((x, y)) = self.robot {
             print(x, y, "^", Color::Reset);
         }
         for circle in &self.circles {
             if let Some((x, y, label)) = &circle.label {
-                print(*x, *y, label, colour(circle.colour));
+                print(*x, *y, label, ink(circle.color));
             }
         }
         for (x, y, number) in &self.sensors {
             print(*x, *y, number, Color::Reset);
         }
         for (x, y, number) in &self.people {
-            print(*x, *y, number, colour(Color::LightGreen));
+            print(*x, *y, number, ink(Color::LightGreen));
         }
         if let Some((x, y)) = self.pointer {
             print(x, y, "X", Color::Reset);
@@ -259,12 +248,12 @@ impl Layers {
     }
 }
 
-/// To the right and up, of metres ahead and to the left.
+/// Converts meters ahead and to the left to the right and up.
 fn turned((x, y): (f64, f64)) -> (f64, f64) {
     (-y, x)
 }
 
-/// `line` from end to end, dot by dot.
+/// Returns the dots of `line` from end to end.
 fn dots_of(line: &scanhub_schema::Line, dot_m: f64) -> Dots {
     let [x1, y1, x2, y2] = [line.x1_m, line.y1_m, line.x2_m, line.y2_m].map(f64::from);
     let steps = ((x2 - x1).hypot(y2 - y1) / dot_m).ceil().clamp(1.0, 2000.0);
@@ -272,7 +261,7 @@ fn dots_of(line: &scanhub_schema::Line, dot_m: f64) -> Dots {
     (0..=steps as u32).map(at).map(turned).collect()
 }
 
-/// `circle` as a dotted line, from the top on.
+/// Returns `circle` as a dotted line, from the top on.
 fn dotted(circle: &crate::scene::Circle, dot_m: f64) -> Circle {
     let radius = circle.radius_m;
     let points = (radius / dot_m * std::f64::consts::TAU / CIRCLE_DOTS).clamp(8.0, 360.0) as u32;
@@ -282,23 +271,26 @@ fn dotted(circle: &crate::scene::Circle, dot_m: f64) -> Circle {
     Circle {
         dots: (0..points).map(at).map(|at| (radius * at.sin(), radius * at.cos())).collect(),
         label: is_large.then(|| (0.0, radius, format!("{radius:.2}{sign}"))),
-        colour: colour(circle.verdict),
+        color: color(circle.verdict),
     }
 }
 
-/// Metres between two crossings of the grid: a round length that is long enough to be counted.
-pub(super) fn grid_step_m(dot_m: f64) -> f64 {
+/// Returns the distance between two crossings of the grid in meters: a round length of at least [`GRID_DOTS`].
+fn grid_step_m(dot_m: f64) -> f64 {
     STEPS_M.into_iter().find(|step| *step >= GRID_DOTS * dot_m).unwrap_or(50.0)
 }
 
-/// Without an intensity, and from the darkest to the brightest: what the palette has from cold to warm.
+/// Colors of points without an intensity, and from the darkest to the brightest.
 const SHADES: [Color; 5] = [Color::Reset, Color::Blue, Color::Cyan, Color::Green, Color::Yellow];
 const STEPS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
-/// The least between two crossings.
+/// Minimum distance between two crossings.
 const GRID_DOTS: f64 = 18.0;
-/// Dots between two of an axis.
+/// Distance between two dots of an axis.
 const AXIS_DOTS: f64 = 4.0;
-/// Dots between two of a circle.
+/// Distance between two dots of a circle.
 const CIRCLE_DOTS: f64 = 3.0;
-/// Circles of a smaller radius have no room for a label.
+/// Minimum radius of a circle with a label.
 const LABEL_DOTS: f64 = 7.0;
+
+#[cfg(all(test, feature = "web"))]
+mod tests;

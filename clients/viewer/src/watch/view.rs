@@ -1,24 +1,23 @@
-//! Which part of a scene is shown and at which scale, and how keys and the mouse change that. Of the terminal it knows only
-//! those, and where the picture is.
+//! The part of a scene that is shown, its scale and its layers, and how keys and the mouse change them.
 
 use ratatui::layout::{Position, Rect};
 
-use super::keys::Key;
 use super::map::DOTS;
+use super::terminal::Key;
 use crate::scene::{Scene, Sensor};
 
-/// What is shown.
+/// Part of the scene that is shown, with scale and layers.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
-    /// One sensor by its number from 0, or the robot with all of its own.
+    /// Index of the only sensor that is shown; `None` for all sensors of the robot.
     pub(crate) only: Option<usize>,
-    /// Where the picture is on the screen, in cells.
+    /// Area of the picture on the screen, in cells.
     pub(crate) map: Rect,
-    /// What is in the middle of it, in metres in the robot's frame.
-    pub(crate) centre_m: (f64, f64),
-    /// Metres between two dots.
+    /// Center of the picture, in meters in the robot's frame.
+    pub(crate) center_m: (f64, f64),
+    /// Meters between two dots.
     pub(crate) dot_m: f64,
-    /// Place and size follow what is seen.
+    /// Whether center and scale follow the points.
     pub(crate) fits: bool,
     pub(crate) foreground: bool,
     pub(crate) background: bool,
@@ -26,45 +25,45 @@ pub(crate) struct View {
     pub(crate) zones: bool,
     pub(crate) trails: bool,
     pub(crate) grid: bool,
-    /// Points have the colour of what came back.
+    /// Whether the color of a point shows its intensity.
     pub(crate) intensity: bool,
-    /// Straight surfaces and corners, which the hub looks for only as long as somebody follows them.
+    /// Line features and corners. The hub computes them only while they have a subscriber.
     pub(crate) lines: bool,
-    /// What is read out, in metres in the robot's frame; arrows move it.
+    /// Position of the pointer, in meters in the robot's frame; arrows move it.
     pub(crate) pointer_m: Option<(f64, f64)>,
-    /// Counters instead of the picture.
+    /// Whether counters are shown instead of the picture.
     pub(crate) counters: bool,
-    /// The picture stands still.
+    /// Whether the picture is frozen.
     pub(crate) paused: bool,
     pub(crate) help: bool,
-    /// Colours may be used.
-    pub(crate) colours: bool,
-    /// What stands below the picture for as long as it does.
+    /// Whether colors may be used.
+    pub(crate) colors: bool,
+    /// Text next to the keys.
     pub(crate) note: String,
-    /// What became of a request, in words; empty if there is nothing new.
-    pub(crate) news: String,
+    /// Message in place of the keys; empty if there is none.
+    pub(crate) message: String,
 }
 
-/// What a key asks for beyond the picture.
+/// Command of a key that does not only change the view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Wish {
-    /// To end.
+pub(crate) enum ViewCommand {
+    /// End the program.
     Quit,
-    /// To end, as by a signal.
+    /// End the program as if by a signal.
     Interrupt,
-    /// To learn the background again.
+    /// Reset the background.
     Reset,
-    /// To hold the background, or to let it be learned on.
+    /// Freeze or thaw the background.
     Freeze,
 }
 
 impl View {
-    /// All layers of the whole robot.
-    pub(crate) fn new(colours: bool) -> View {
+    /// Shows all layers of the whole robot.
+    pub(crate) fn new(colors: bool) -> View {
         View {
             only: None,
             map: Rect::default(),
-            centre_m: (0.0, 0.0),
+            center_m: (0.0, 0.0),
             dot_m: FIRST_DOT_M,
             fits: true,
             foreground: true,
@@ -79,13 +78,13 @@ impl View {
             counters: false,
             paused: false,
             help: false,
-            colours,
+            colors,
             note: String::new(),
-            news: String::new(),
+            message: String::new(),
         }
     }
 
-    /// The sensors that are shown, with their numbers from 0.
+    /// Returns the sensors that are shown, with their indices.
     pub(crate) fn shown<'a>(&self, scene: &'a Scene) -> Vec<(usize, &'a Sensor)> {
         match self.only.and_then(|n| Some((n, scene.sensors.get(n)?))) {
             Some(one) => vec![one],
@@ -93,23 +92,23 @@ impl View {
         }
     }
 
-    /// Takes a key, with `scene` on the screen; what is left to be done for it.
-    pub(crate) fn key(&mut self, key: Key, scene: &Scene) -> Option<Wish> {
+    /// Handles a key while `scene` is on the screen. Returns the command that is left to the caller.
+    pub(crate) fn key(&mut self, key: Key, scene: &Scene) -> Option<ViewCommand> {
         match key {
-            Key::Interrupt => return Some(Wish::Interrupt),
+            Key::Interrupt => return Some(ViewCommand::Interrupt),
             Key::Escape if self.help => self.help = false,
             Key::Escape if self.pointer_m.is_some() => self.pointer_m = None,
             Key::Escape if self.counters => self.counters = false,
-            Key::Sign('q') | Key::Escape => return Some(Wish::Quit),
-            Key::Sign('R') => return Some(Wish::Reset),
-            Key::Sign('F') => return Some(Wish::Freeze),
+            Key::Sign('q') | Key::Escape => return Some(ViewCommand::Quit),
+            Key::Sign('R') => return Some(ViewCommand::Reset),
+            Key::Sign('F') => return Some(ViewCommand::Freeze),
             Key::Sign('?') => self.help = !self.help,
             Key::Sign(' ') => self.paused = !self.paused,
             Key::Sign('+' | '=') => self.zoom(1.0 / ZOOM),
             Key::Sign('-') => self.zoom(ZOOM),
             Key::Sign('c') => self.fits = true,
             Key::Sign('x') => {
-                self.pointer_m = if self.pointer_m.is_none() { Some(self.centre_m) } else { None }
+                self.pointer_m = if self.pointer_m.is_none() { Some(self.center_m) } else { None }
             }
             Key::Left | Key::Right | Key::Up | Key::Down => self.go(key),
             Key::Point(..) | Key::WheelUp(..) | Key::WheelDown(..) if self.help || self.counters => {}
@@ -139,8 +138,8 @@ impl View {
         None
     }
 
-    /// Brings what is seen into the picture, unless a person chose its place; keeps what is about right, because a
-    /// picture that breathes cannot be read.
+    /// Fits the points into the picture, unless the user has moved it. If they fit already and the scale is about right, nothing
+    /// changes, because a picture that changes its scale often cannot be read.
     pub(crate) fn fit(&mut self, scene: &Scene) {
         let dots = (f64::from(self.map.width.max(1)) * DOTS.0, f64::from(self.map.height.max(1)) * DOTS.1);
         let shown = self.shown(scene);
@@ -149,7 +148,7 @@ impl View {
             return;
         }
         let reach = shown.iter().flat_map(|(_, sensor)| sensor.zones.zones().iter());
-        let reach = reach.map(|zone| f64::from(zone.radius_mm) / 1000.0).fold(LEAST_M, f64::max);
+        let reach = reach.map(|zone| f64::from(zone.radius_mm) / 1000.0).fold(MIN_REACH_M, f64::max);
         let ahead = span(seen.iter().map(|point| point.x_m).collect(), reach);
         let aside = span(seen.iter().map(|point| point.y_m).collect(), reach);
         let needed = ((aside.1 - aside.0) / dots.0).max((ahead.1 - ahead.0) / dots.1) * MARGIN;
@@ -157,14 +156,14 @@ impl View {
             let half = self.dot_m * dots / 2.0;
             middle - half <= span.0 && span.1 <= middle + half
         };
-        let is_in = fits(self.centre_m.0, ahead, dots.1) && fits(self.centre_m.1, aside, dots.0);
+        let is_in = fits(self.center_m.0, ahead, dots.1) && fits(self.center_m.1, aside, dots.0);
         if !is_in || needed < TOO_SMALL * self.dot_m {
             self.dot_m = needed;
-            self.centre_m = ((ahead.0 + ahead.1) / 2.0, (aside.0 + aside.1) / 2.0);
+            self.center_m = ((ahead.0 + ahead.1) / 2.0, (aside.0 + aside.1) / 2.0);
         }
     }
 
-    /// The place in the middle of a cell of the screen, in metres in the robot's frame; nothing beside the picture.
+    /// Returns the position of the middle of a cell, in meters in the robot's frame; `None` outside the picture.
     fn at_m(&self, column: u16, row: u16) -> Option<(f64, f64)> {
         if !self.map.contains(Position { x: column, y: row }) {
             return None;
@@ -174,15 +173,15 @@ impl View {
             |cell: u16, cells: u16, dots: f64| (f64::from(cell) + 0.5 - f64::from(cells) / 2.0) * dots;
         let right = from_middle(column - self.map.x, self.map.width, DOTS.0);
         let down = from_middle(row - self.map.y, self.map.height, DOTS.1);
-        Some((self.centre_m.0 - down * self.dot_m, self.centre_m.1 - right * self.dot_m))
+        Some((self.center_m.0 - down * self.dot_m, self.center_m.1 - right * self.dot_m))
     }
 
-    /// Changes the size of the picture, and what is in this cell of the screen stays there.
+    /// Changes the scale around this cell of the screen.
     fn zoom_at(&mut self, column: u16, row: u16, factor: f64) {
         let Some(before) = self.at_m(column, row) else { return };
         self.zoom(factor);
         let after = self.at_m(column, row).unwrap_or(before);
-        self.centre_m = (self.centre_m.0 + before.0 - after.0, self.centre_m.1 + before.1 - after.1);
+        self.center_m = (self.center_m.0 + before.0 - after.0, self.center_m.1 + before.1 - after.1);
     }
 
     fn zoom(&mut self, factor: f64) {
@@ -190,7 +189,7 @@ impl View {
         self.dot_m = (self.dot_m * factor).clamp(FINEST_DOT_M, COARSEST_DOT_M);
     }
 
-    /// An arrow moves what is read out by a cell, or else the picture.
+    /// Moves the pointer by a cell, or the picture if there is no pointer.
     fn go(&mut self, arrow: Key) {
         let (ahead, left) = match arrow {
             Key::Up => (1.0, 0.0),
@@ -205,42 +204,44 @@ impl View {
         }
     }
 
-    /// By steps ahead and to the left.
+    /// Moves the picture by steps ahead and to the left.
     fn pan(&mut self, ahead: f64, left: f64) {
         self.fits = false;
         let step = STEP_DOTS * self.dot_m;
-        let moved = |at: f64, steps: f64| (at + steps * step).clamp(-FARTHEST_M, FARTHEST_M);
-        self.centre_m = (moved(self.centre_m.0, ahead), moved(self.centre_m.1, left));
+        let moved = |at: f64, steps: f64| (at + steps * step).clamp(-MAX_CENTER_M, MAX_CENTER_M);
+        self.center_m = (moved(self.center_m.0, ahead), moved(self.center_m.1, left));
     }
 
-    /// Sensor number `n` alone, or all where there is none.
+    /// Shows only the sensor with index `n`, or all if it does not exist.
     fn choose(&mut self, n: usize, scene: &Scene) {
         self.only = (n < scene.sensors.len()).then_some(n);
     }
 }
 
-/// From the least to the greatest of `values`, few outliers left out, and at least `reach` around the centre.
+/// Returns minimum and maximum of `values` without a few outliers, and at least `reach` around the center.
 fn span(mut values: Vec<f64>, reach: f64) -> (f64, f64) {
     values.sort_by(f64::total_cmp);
     let out = values.len() / OUTLIERS;
     (values[out].min(-reach), values[values.len() - 1 - out].max(reach))
 }
 
-/// Of one step of zoom and pan.
+/// Factor of a step of zoom.
 const ZOOM: f64 = 1.25;
+/// Distance of a step of pan.
 const STEP_DOTS: f64 = 8.0;
-/// Before anything is seen: eight metres in a picture of eighty columns.
+/// Scale before the first scan: eight meters in a picture of 80 columns.
 const FIRST_DOT_M: f64 = 0.05;
 const FINEST_DOT_M: f64 = 0.001;
 const COARSEST_DOT_M: f64 = 1.0;
-/// Farther than a sensor sees (82 m) from where it may sit (100 m).
-const FARTHEST_M: f64 = 200.0;
-/// At least so much around the robot.
-const LEAST_M: f64 = 0.5;
+/// Maximum distance of the center. It is more than the range of a sensor (82 m) beyond its maximum distance from the robot (100 m).
+const MAX_CENTER_M: f64 = 200.0;
+/// Minimum distance around the robot that is shown.
+const MIN_REACH_M: f64 = 0.5;
+/// Size of the picture relative to the points.
 const MARGIN: f64 = 1.1;
-/// A picture that would be enough at this share of its size is redrawn.
+/// The scale changes if the points need less than this share of the picture.
 const TOO_SMALL: f64 = 0.6;
-/// One of so many points, at either end, is not worth a smaller picture.
+/// Points per point that may lie outside at either end.
 const OUTLIERS: usize = 50;
 
 #[cfg(test)]
@@ -248,7 +249,7 @@ mod tests {
     use super::*;
     use scanhub_schema::{Header, Scan, ScanHead, Status};
 
-    fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
+    fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<ViewCommand> {
         keys.chars().map(|key| view.key(Key::Sign(key), scene)).last().flatten()
     }
 
@@ -286,19 +287,19 @@ mod tests {
         let (mut view, scene) = (View::new(false), two());
         press(&mut view, &scene, "?");
         assert_eq!(view.key(Key::Escape, &scene), None);
-        assert_eq!(view.key(Key::Escape, &scene), Some(Wish::Quit));
-        assert_eq!(press(&mut view, &scene, "q"), Some(Wish::Quit));
-        assert_eq!(press(&mut view, &scene, "R"), Some(Wish::Reset));
-        assert_eq!(press(&mut view, &scene, "F"), Some(Wish::Freeze));
-        assert_eq!(view.key(Key::Interrupt, &scene), Some(Wish::Interrupt));
+        assert_eq!(view.key(Key::Escape, &scene), Some(ViewCommand::Quit));
+        assert_eq!(press(&mut view, &scene, "q"), Some(ViewCommand::Quit));
+        assert_eq!(press(&mut view, &scene, "R"), Some(ViewCommand::Reset));
+        assert_eq!(press(&mut view, &scene, "F"), Some(ViewCommand::Freeze));
+        assert_eq!(view.key(Key::Interrupt, &scene), Some(ViewCommand::Interrupt));
         assert!(view.fits, "and c with it does not mean the picture");
     }
 
     #[test]
-    fn arrows_move_what_is_read_out_while_there_is_such() {
+    fn arrows_move_the_pointer_if_there_is_one() {
         let (mut view, scene) = (View::new(false), two());
         view.key(Key::Up, &scene);
-        let moved = view.centre_m;
+        let moved = view.center_m;
         assert!(moved.0 > 0.0, "the picture");
         press(&mut view, &scene, "x");
         view.key(Key::Left, &scene);
@@ -308,51 +309,51 @@ mod tests {
             (moved.0 - x - 4.0 * view.dot_m).abs() < 1e-9 && (y - 2.0 * view.dot_m).abs() < 1e-9,
             "a cell"
         );
-        assert_eq!(view.centre_m, moved);
+        assert_eq!(view.center_m, moved);
         assert_eq!((view.key(Key::Escape, &scene), view.pointer_m), (None, None));
-        assert_eq!(view.key(Key::Escape, &scene), Some(Wish::Quit));
+        assert_eq!(view.key(Key::Escape, &scene), Some(ViewCommand::Quit));
     }
 
     #[test]
-    fn the_mouse_reads_and_its_wheel_zooms_where_it_is() {
+    fn mouse_moves_the_pointer_and_wheel_zooms_around_it() {
         let (mut view, scene) = (View::new(false), two());
         view.map = Rect::new(0, 1, 60, 16);
-        (view.centre_m, view.dot_m) = ((2.0, 1.0), 0.1);
+        (view.center_m, view.dot_m) = ((2.0, 1.0), 0.1);
         // A cell has 2 dots across and 4 up.
         view.key(Key::Point(30, 9), &scene);
         let (x, y) = view.pointer_m.unwrap();
         assert!((x - 1.8).abs() < 1e-9 && (y - 0.9).abs() < 1e-9, "{x} {y}");
         view.key(Key::Point(3, 0), &scene);
-        assert_eq!(view.pointer_m, Some((x, y)), "beside the picture");
+        assert_eq!(view.pointer_m, Some((x, y)), "outside the picture");
         let there = view.at_m(50, 3).unwrap();
         view.key(Key::WheelUp(50, 3), &scene);
         let still = view.at_m(50, 3).unwrap();
         assert!((view.dot_m - 0.08).abs() < 1e-9 && !view.fits);
         assert!((there.0 - still.0).hypot(there.1 - still.1) < 1e-9, "{there:?} {still:?}");
         view.key(Key::WheelDown(50, 3), &scene);
-        assert!((view.dot_m - 0.1).abs() < 1e-9 && (view.centre_m.0 - 2.0).abs() < 1e-9);
+        assert!((view.dot_m - 0.1).abs() < 1e-9 && (view.center_m.0 - 2.0).abs() < 1e-9);
         press(&mut view, &scene, "?");
         view.key(Key::Point(10, 10), &scene);
         assert_eq!(view.pointer_m, Some((x, y)), "the help is over it");
     }
 
     #[test]
-    fn the_picture_fits_until_a_person_chooses_and_again_when_asked() {
+    fn picture_fits_until_it_is_moved_and_after_c() {
         let (mut view, scene) = (View::new(false), two());
         view.map = Rect::new(0, 1, 60, 17);
         view.fit(&scene);
         let fitted = view.clone();
-        // Half a circle of four metres ahead, and half a metre behind.
-        assert!((fitted.centre_m.0 - 1.75).abs() < 0.1 && fitted.centre_m.1.abs() < 0.01, "{fitted:?}");
+        // Half a circle of four meters ahead, and half a meter behind.
+        assert!((fitted.center_m.0 - 1.75).abs() < 0.1 && fitted.center_m.1.abs() < 0.01, "{fitted:?}");
         assert!((8.0..10.0).contains(&(fitted.dot_m * 120.0)), "{fitted:?}");
         press(&mut view, &scene, "+l");
-        assert!(view.dot_m < fitted.dot_m && view.centre_m.1 < 0.0, "right is negative");
-        let chosen = view.centre_m;
+        assert!(view.dot_m < fitted.dot_m && view.center_m.1 < 0.0, "right is negative");
+        let chosen = view.center_m;
         view.fit(&scene);
-        assert_eq!(view.centre_m, chosen);
+        assert_eq!(view.center_m, chosen);
         press(&mut view, &scene, "kkkkkkkkkkkkkkkkkkkk");
         press(&mut view, &scene, "c");
         view.fit(&scene);
-        assert_eq!((view.centre_m, view.dot_m), (fitted.centre_m, fitted.dot_m));
+        assert_eq!((view.center_m, view.dot_m), (fitted.center_m, fitted.dot_m));
     }
 }

@@ -1,81 +1,76 @@
-//! Circles, marks, lines and people as `foxglove.SceneUpdate`, encoded as JSON. Each message has all there is: what is not in the next one
-//! would stay, so entities live for a second only.
+//! Circles, marks, line features, people and obstacles as `foxglove.SceneUpdate` in JSON. Each message has all entities of its
+//! channel. Viewers keep entities that are missing in the next message, so an entity has a lifetime of a second.
 
-mod obstacles;
-
-use crate::scene::{Ellipse, People, Scene, circles};
 use scanhub_ros::BASE_FRAME;
-use scanhub_schema::Verdict;
+use scanhub_schema::{Header, Obstacle, Obstacles, Verdict};
 use serde::Serialize;
 
-use super::{bytes, json};
-use crate::server::board::Channel;
-
-pub use obstacles::obstacles;
+use super::{json_bytes, json_channel};
+use crate::scene::{Circle, Ellipse, People, Point, Scene, circles};
+use crate::server::Channel;
 
 pub(super) fn channel(topic: &str) -> Channel {
-    json(topic.to_owned(), "foxglove.SceneUpdate", include_str!("scene_update.json"))
+    json_channel(topic.to_owned(), "foxglove.SceneUpdate", include_str!("scene_update.json"))
 }
 
-/// The circles of the robot's sensors, each with its radius and verdict as metadata, and for each sensor that sees something
-/// inside one the nearest beam that does.
+/// Encodes the circles of the robot's sensors, each with its radius and verdict as metadata. For each sensor with points inside a
+/// circle, adds the beam of the nearest point.
 pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let around = circles(scene.robot().map(|(_, sensor)| sensor));
     let mut entities = Vec::new();
     for circle in &around {
         let mut entity = Entity::new(format!("zone {:.3}", circle.radius_m), wall_ns);
-        entity.tell("radius_m", format!("{:.3}", circle.radius_m));
-        entity.tell("verdict", circle.verdict.name().to_owned());
-        entity.cylinders.push(disc((0.0, 0.0), 2.0 * circle.radius_m, colour(circle.verdict, 0.18)));
+        entity.add("radius_m", format!("{:.3}", circle.radius_m));
+        entity.add("verdict", circle.verdict.name().to_owned());
+        entity.cylinders.push(disc((0.0, 0.0), 2.0 * circle.radius_m, color(circle.verdict, 0.18)));
         let label = format!("{:.2} m", circle.radius_m);
-        entity.texts.push(Text::new(at(circle.radius_m, 0.0), 12.0, colour(circle.verdict, 1.0), label));
+        entity.texts.push(Text::new(at(circle.radius_m, 0.0), 12.0, color(circle.verdict, 1.0), label));
         entities.push(entity);
     }
     for (_, sensor) in scene.robot() {
-        let near =
-            |a: &crate::scene::Point, b: &crate::scene::Point| a.distance_m().total_cmp(&b.distance_m());
+        let near = |a: &Point, b: &Point| a.distance_m().total_cmp(&b.distance_m());
         let inside = around.iter().filter_map(|circle| Some((circle.inside(sensor).min_by(near)?, circle)));
-        let smallest = |a: &crate::scene::Circle, b: &crate::scene::Circle| a.radius_m.total_cmp(&b.radius_m);
+        let smallest = |a: &Circle, b: &Circle| a.radius_m.total_cmp(&b.radius_m);
         let Some((point, circle)) = inside.min_by(|a, b| smallest(a.1, b.1)) else { continue };
         let mut entity = Entity::new(format!("beam {}", sensor.name), wall_ns);
-        entity.tell("sensor", sensor.name.clone());
-        entity.tell("beam", point.beam.to_string());
-        entity.tell("distance_m", format!("{:.3}", point.distance_m()));
-        entity.tell("verdict", circle.verdict.name().to_owned());
+        entity.add("sensor", sensor.name.clone());
+        entity.add("beam", point.beam.to_string());
+        entity.add("distance_m", format!("{:.3}", point.distance_m()));
+        entity.add("verdict", circle.verdict.name().to_owned());
         let from = sensor.placement.pose().unwrap_or_default();
         let points = [(from.x_m, from.y_m), (point.x_m, point.y_m)];
-        let color = colour(circle.verdict, 1.0);
+        let color = color(circle.verdict, 1.0);
         entity.lines.push(LinePrimitive::new(LINE_STRIP, points.into_iter(), color));
         entities.push(entity);
     }
     update(&entities)
 }
 
-/// The people of one tracker with their numbers, their tails, and around each the ellipse that holds the true place in 95 of 100
-/// cases; in the robot's frame, which is the map of the site for who follows a tracker. Who is not seen is pale.
+/// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position in 95 of 100
+/// cases. The frame is the robot's; with a tracker, that is the map of the site. People who are not seen are pale.
 pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
         let (x, y) = person.position;
-        let colour = Colour { a: if person.is_seen() { 1.0 } else { PALE }, ..PERSON };
+        let color = Color { a: if person.is_seen() { 1.0 } else { PALE }, ..PERSON };
         let mut entity = Entity::new(format!("person {}", person.id), wall_ns);
-        entity.tell("id", person.id.to_string());
-        entity.tell("state", person.state.name().to_owned());
-        entity.tell("room", person.room.clone().unwrap_or_default());
-        entity.cylinders.push(disc((x, y), PERSON_M, colour));
-        entity.cylinders.push(oval((x, y), &person.reach, Colour { a: FAINT, ..PERSON }));
-        entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), colour));
-        entity.texts.push(Text::new(at(x, y), 14.0, colour, format!("#{}", person.id)));
+        entity.add("id", person.id.to_string());
+        entity.add("state", person.state.name().to_owned());
+        entity.add("room", person.room.clone().unwrap_or_default());
+        entity.cylinders.push(disc((x, y), PERSON_M, color));
+        entity.cylinders.push(oval((x, y), &person.reach, Color { a: FAINT, ..PERSON }));
+        entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), color));
+        entity.texts.push(Text::new(at(x, y), 14.0, color, format!("#{}", person.id)));
         entity
     });
     update(&entities.collect::<Vec<_>>())
 }
 
-/// The lines of the robot's sensors, from end to end, and where two meet.
+/// Encodes the line features of the robot's sensors, and their corners.
 pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().filter_map(|(_, sensor)| {
         let found = sensor.lines()?;
         let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
-        entity.tell("sensor", sensor.name.clone());
+        entity.add("sensor", sensor.name.clone());
         let ends = |line: &scanhub_schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
         let points = found.lines().iter().flat_map(ends).map(|(x, y)| (x.into(), y.into()));
         entity.lines.push(LinePrimitive::new(LINE_LIST, points, LINE));
@@ -87,18 +82,76 @@ pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     update(&entities.collect::<Vec<_>>())
 }
 
-/// The reflector marks of the robot's sensors.
+/// Encodes the reflector marks of the robot's sensors.
 pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().map(|(_, sensor)| {
         let mut entity = Entity::new(format!("marks {}", sensor.name), wall_ns);
-        entity.tell("sensor", sensor.name.clone());
+        entity.add("sensor", sensor.name.clone());
         entity.spheres = sensor.mark_points().into_iter().map(|mark| ball(mark, MARK_M, MARK)).collect();
         entity
     });
     update(&entities.collect::<Vec<_>>())
 }
 
-#[derive(Serialize)]
+/// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The first entity
+/// has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`, and `words`, a summary
+/// as text. Sweeps end when the mount reverses, so each message deletes all earlier entities, and has its own lifetime.
+pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
+    let lifetime = || Time::of(lifetime_ns(header));
+    let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };
+    sweep.add("sweep", found.sweep.to_string());
+    sweep.add("generation", found.generation.to_string());
+    sweep.add("complete", found.has(Obstacles::COMPLETE).to_string());
+    sweep.add("doubted", found.has(Obstacles::DOUBTED).to_string());
+    sweep.add("left_out", found.left_out.to_string());
+    sweep.add("words", words(found));
+    let boxes = found.obstacles().iter().enumerate().map(|(number, one)| {
+        let id = format!("obstacle {number}");
+        let mut entity = Entity { lifetime: lifetime(), ..Entity::new(id, header.wall_ns) };
+        entity.add("distance_m", format!("{:.3}", one.distance_m));
+        entity.add("points", one.points.to_string());
+        entity.add("foreground", one.has(Obstacle::FOREGROUND).to_string());
+        entity.add("near", one.has(Obstacle::NEAR).to_string());
+        let color = if one.has(Obstacle::NEAR) { NEAR } else { FOREGROUND };
+        let axis = |axis: usize| (f64::from(one.low[axis]), f64::from(one.high[axis]));
+        let [x, y, z] = [0, 1, 2].map(axis);
+        let middle = |(low, high): (f64, f64)| (low + high) / 2.0;
+        let size = Vector { x: x.1 - x.0, y: y.1 - y.0, z: z.1 - z.0 };
+        entity.cubes.push(Shape { pose: at_height(middle(x), middle(y), middle(z)), size, color });
+        let label = format!("{:.2} m", one.distance_m);
+        entity.texts.push(Text::new(
+            at_height(middle(x), middle(y), z.1),
+            14.0,
+            Color { a: 1.0, ..color },
+            label,
+        ));
+        entity
+    });
+    let entities: Vec<Entity> = std::iter::once(sweep).chain(boxes).collect();
+    let all_before = Deletion { timestamp: Time::of(header.wall_ns), kind: DELETE_ALL, id: "" };
+    json_bytes(&Update { deletions: &[all_before], entities: &entities })
+}
+
+/// Returns the lifetime of a sweep's obstacles in ns: the duration of two more sweeps, and some time to process them.
+fn lifetime_ns(header: &Header) -> u64 {
+    2 * header.stamp_last_ns.saturating_sub(header.stamp_first_ns).min(MAX_SWEEP_NS) + PROCESSING_NS
+}
+
+fn words(found: &Obstacles) -> String {
+    if found.has(Obstacles::DOUBTED) {
+        return "sweep doubted, its angles contradict what is known".to_owned();
+    }
+    let count = u64::from(found.left_out) + found.obstacles().len() as u64;
+    let plural = if count == 1 { "" } else { "s" };
+    let obstacles = found.obstacles().first().map_or("no obstacle".to_owned(), |nearest| {
+        // One decimal, because screen readers read the text whenever it changes.
+        format!("{count} obstacle{plural}, nearest {:.1} m", nearest.distance_m)
+    });
+    let incomplete = if found.has(Obstacles::COMPLETE) { "" } else { ", sweep incomplete" };
+    format!("{obstacles}{incomplete}")
+}
+
+#[derive(Default, Serialize)]
 struct Entity {
     timestamp: Time,
     frame_id: &'static str,
@@ -107,8 +160,8 @@ struct Entity {
     frame_locked: bool,
     metadata: Vec<KeyValue>,
     arrows: [(); 0],
-    cubes: Vec<Cube>,
-    spheres: Vec<Sphere>,
+    cubes: Vec<Shape>,
+    spheres: Vec<Shape>,
     cylinders: Vec<Cylinder>,
     lines: Vec<LinePrimitive>,
     triangles: [(); 0],
@@ -116,7 +169,7 @@ struct Entity {
     models: [(); 0],
 }
 
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 struct Time {
     sec: u64,
     nsec: u64,
@@ -150,25 +203,19 @@ struct Pose {
 }
 
 #[derive(Clone, Copy, Serialize)]
-struct Colour {
+struct Color {
     r: f64,
     g: f64,
     b: f64,
     a: f64,
 }
 
+/// A cube or a sphere.
 #[derive(Serialize)]
-struct Cube {
+struct Shape {
     pose: Pose,
     size: Vector,
-    color: Colour,
-}
-
-#[derive(Serialize)]
-struct Sphere {
-    pose: Pose,
-    size: Vector,
-    color: Colour,
+    color: Color,
 }
 
 #[derive(Serialize)]
@@ -177,7 +224,7 @@ struct Cylinder {
     size: Vector,
     bottom_scale: f64,
     top_scale: f64,
-    color: Colour,
+    color: Color,
 }
 
 #[derive(Serialize)]
@@ -186,7 +233,7 @@ struct Text {
     billboard: bool,
     font_size: f64,
     scale_invariant: bool,
-    color: Colour,
+    color: Color,
     text: String,
 }
 
@@ -198,7 +245,7 @@ struct LinePrimitive {
     thickness: f64,
     scale_invariant: bool,
     points: Vec<Vector>,
-    color: Colour,
+    color: Color,
     colors: [(); 0],
     indices: [(); 0],
 }
@@ -210,15 +257,15 @@ impl Time {
 }
 
 impl Text {
-    /// Of that many pixels, and turned to who looks.
-    fn new(pose: Pose, font_size: f64, color: Colour, text: String) -> Text {
+    /// Creates a text of this size in pixels that faces the viewer.
+    fn new(pose: Pose, font_size: f64, color: Color, text: String) -> Text {
         Text { pose, billboard: true, font_size, scale_invariant: true, color, text }
     }
 }
 
 impl LinePrimitive {
-    /// Two pixels wide, through these points of the robot's frame.
-    fn new(kind: u8, points: impl Iterator<Item = (f64, f64)>, color: Colour) -> LinePrimitive {
+    /// Creates a line of two pixels through these points of the robot's frame.
+    fn new(kind: u8, points: impl Iterator<Item = (f64, f64)>, color: Color) -> LinePrimitive {
         LinePrimitive {
             kind,
             pose: at(0.0, 0.0),
@@ -234,31 +281,17 @@ impl LinePrimitive {
 
 impl Entity {
     fn new(id: String, wall_ns: u64) -> Entity {
-        Entity {
-            timestamp: Time::of(wall_ns),
-            frame_id: BASE_FRAME,
-            id,
-            lifetime: Time { sec: 1, nsec: 0 },
-            frame_locked: true,
-            metadata: Vec::new(),
-            arrows: [],
-            cubes: Vec::new(),
-            spheres: Vec::new(),
-            cylinders: Vec::new(),
-            lines: Vec::new(),
-            triangles: [],
-            texts: Vec::new(),
-            models: [],
-        }
+        let (timestamp, lifetime) = (Time::of(wall_ns), Time { sec: 1, nsec: 0 });
+        Entity { timestamp, frame_id: BASE_FRAME, id, lifetime, frame_locked: true, ..Entity::default() }
     }
 
-    fn tell(&mut self, key: &'static str, value: String) {
+    fn add(&mut self, key: &'static str, value: String) {
         self.metadata.push(KeyValue { key, value });
     }
 }
 
 fn update(entities: &[Entity]) -> Vec<u8> {
-    bytes(&Update { deletions: &[], entities })
+    json_bytes(&Update { deletions: &[], entities })
 }
 
 #[derive(Serialize)]
@@ -276,34 +309,38 @@ struct Deletion {
 }
 
 fn at(x: f64, y: f64) -> Pose {
-    let (position, orientation) = (Vector { x, y, z: 0.0 }, Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 });
+    at_height(x, y, 0.0)
+}
+
+fn at_height(x: f64, y: f64, z: f64) -> Pose {
+    let (position, orientation) = (Vector { x, y, z }, Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 });
     Pose { position, orientation }
 }
 
-fn ball((x, y): (f64, f64), across: f64, color: Colour) -> Sphere {
-    Sphere { pose: at(x, y), size: Vector { x: across, y: across, z: across }, color }
+fn ball((x, y): (f64, f64), across: f64, color: Color) -> Shape {
+    Shape { pose: at(x, y), size: Vector { x: across, y: across, z: across }, color }
 }
 
-fn disc((x, y): (f64, f64), across: f64, color: Colour) -> Cylinder {
+fn disc((x, y): (f64, f64), across: f64, color: Color) -> Cylinder {
     let size = Vector { x: across, y: across, z: FLAT_M };
     Cylinder { pose: at(x, y), size, bottom_scale: 1.0, top_scale: 1.0, color }
 }
 
-fn oval((x, y): (f64, f64), of: &Ellipse, color: Colour) -> Cylinder {
+fn oval((x, y): (f64, f64), of: &Ellipse, color: Color) -> Cylinder {
     let (z, w) = (of.yaw_rad / 2.0).sin_cos();
     let pose = Pose { orientation: Quaternion { x: 0.0, y: 0.0, z, w }, ..at(x, y) };
     let size = Vector { x: 2.0 * of.long_m, y: 2.0 * of.short_m, z: FLAT_M };
     Cylinder { pose, size, bottom_scale: 1.0, top_scale: 1.0, color }
 }
 
-/// Green, amber and red, as the page has them.
-fn colour(verdict: Verdict, a: f64) -> Colour {
+/// Returns green, amber or red as on the page.
+fn color(verdict: Verdict, a: f64) -> Color {
     let (r, g, b) = match verdict {
         Verdict::Clear => (0.18, 0.62, 0.36),
         Verdict::Slow => (0.85, 0.58, 0.08),
         Verdict::Stop | Verdict::Unknown => (0.84, 0.18, 0.2),
     };
-    Colour { r, g, b, a }
+    Color { r, g, b, a }
 }
 
 const LINE_STRIP: u8 = 0;
@@ -312,10 +349,62 @@ const FLAT_M: f64 = 0.002;
 const MARK_M: f64 = 0.08;
 const CORNER_M: f64 = 0.06;
 
-const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
-const PERSON: Colour = Colour { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
+const LINE: Color = Color { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
+const PERSON: Color = Color { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
 const PERSON_M: f64 = 0.5;
-/// Who is not seen, and where else somebody may be.
+/// Opacity of a person who is not seen, and of an ellipse.
 const PALE: f64 = 0.5;
 const FAINT: f64 = 0.15;
-const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };
+const MARK: Color = Color { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };
+/// `SceneEntityDeletion.ALL`.
+const DELETE_ALL: u8 = 1;
+/// Maximum duration of a sweep that the lifetime allows for, in ns.
+const MAX_SWEEP_NS: u64 = 60_000_000_000;
+/// Time to process a sweep, in ns.
+const PROCESSING_NS: u64 = 1_000_000_000;
+
+const FOREGROUND: Color = Color { r: 0.77, g: 0.07, b: 0.42, a: 0.35 };
+const NEAR: Color = Color { r: 0.84, g: 0.18, b: 0.2, a: 0.35 };
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn obstacles_replace_earlier_ones_and_live_for_two_sweeps() {
+        let header = Header {
+            stamp_first_ns: 1_000_000_000,
+            stamp_last_ns: 2_500_000_000,
+            wall_ns: 7_000_000_009,
+            ..Header::default()
+        };
+        let mut found = Obstacles { sweep: 3, flags: Obstacles::COMPLETE, ..Obstacles::default() };
+        let message = |found: &Obstacles| {
+            serde_json::from_slice::<serde_json::Value>(&obstacles(&header, found)).unwrap()
+        };
+        let empty = message(&found);
+        assert_eq!(empty["deletions"][0]["type"], 1);
+        assert_eq!(empty["deletions"][0]["timestamp"], serde_json::json!({ "sec": 7, "nsec": 9 }));
+        let sweep = &empty["entities"][0];
+        assert_eq!((&sweep["metadata"][0]["value"], &sweep["lifetime"]["sec"]), (&"3".into(), &4.into()));
+        assert_eq!(empty["entities"].as_array().map(Vec::len), Some(1));
+        found.push(Obstacle {
+            low: [1.0, -0.5, 0.0],
+            high: [2.0, 0.5, 1.5],
+            distance_m: 1.0,
+            flags: Obstacle::NEAR,
+            ..Obstacle::default()
+        });
+        let one = &message(&found)["entities"][1];
+        assert_eq!(one["cubes"][0]["pose"]["position"], serde_json::json!({ "x": 1.5, "y": 0.0, "z": 0.75 }));
+        assert_eq!(one["cubes"][0]["size"], serde_json::json!({ "x": 1.0, "y": 1.0, "z": 1.5 }));
+        assert_eq!(words(&found), "1 obstacle, nearest 1.0 m");
+        let mut other = Obstacles { flags: 0, ..found };
+        (0..2 * scanhub_schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
+        assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
+        other = Obstacles { flags: Obstacles::DOUBTED, ..Obstacles::default() };
+        assert_eq!(words(&other), "sweep doubted, its angles contradict what is known");
+        assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
+        assert_eq!(lifetime_ns(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
+    }
+}

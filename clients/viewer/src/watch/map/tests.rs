@@ -1,19 +1,19 @@
-//! The picture in the terminal and what a browser is sent are of the same points: both are made of one scene, and what is sent
-//! is read here as the page reads it.
+//! Compares the picture in the terminal with the messages for a browser: both have the same points. The messages are read here
+//! as the page reads them.
 
 use crate::server::messages;
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
 use scanhub_schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status, Track, Tracks};
 use serde_json::Value as Json;
 
-use super::super::golden;
+use super::super::tests as pictures;
 use super::super::view::View;
 use super::{Dots, Layers};
 use crate::scene::{Scene, Sensor};
 
 /// Two sensors in a room, and one upside down between them, which sees something in half of its beams; one found lines.
 fn scene() -> Scene {
-    let mut scene = golden::scene();
+    let mut scene = pictures::scene();
     let side = scene.sensor("side");
     let pose = Pose { x_m: 0.1, y_m: 0.4, yaw_rad: 1.1, upside_down: 1, ..Pose::default() };
     side.take_status(&Status { pose, ..Status::default() });

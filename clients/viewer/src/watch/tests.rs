@@ -1,6 +1,5 @@
-//! Whole screens of a scene that is made up here, cell by cell, as they stand in `tests/watch`, and the picture of the
-//! documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer golden` writes them
-//! again.
+//! Whole screens of a simulated scene: they are compared cell by cell with the files in `tests/watch`, and with the picture in the
+//! documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer watch::tests` writes the files again.
 
 use std::f64::consts::PI;
 use std::path::Path;
@@ -10,20 +9,21 @@ use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 use scanhub_schema::{
-    Background, BackgroundHead, Counter, Foreground, ForegroundHead, Header, Mark, Marks, Pose, Scan,
-    ScanHead, Segment, State, Status, Track, TrackState, Tracks, Verdict, Zone, Zones,
+    Background, BackgroundHead, Contents, Corner, Counter, Foreground, ForegroundHead, Header, Line, Lines,
+    Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Track, TrackState, Tracks, Verdict, Zone,
+    Zones,
 };
 
-use super::draw::{draw, place_of_map};
+use super::draw::{draw, map_area};
 use super::view::View;
 use crate::scene::{Scene, Sensor};
 
-/// The room, without people: metres ahead and to the left of the robot.
+/// Walls of the room, in meters ahead and to the left of the robot.
 const WALLS: [f64; 4] = [4.2, -3.4, 3.0, -3.6];
-/// Somebody's legs, and somebody behind the robot.
+/// Two legs ahead of the robot, and one behind it.
 const LEGS: [(f64, f64, f64); 3] = [(1.9, 0.9, 0.12), (2.1, 0.6, 0.12), (-0.75, -0.25, 0.1)];
 
-/// Where the beam that leaves `pose` along `direction` ends: at a person, or at the wall.
+/// Returns the length of the beam from `pose` along `direction` to a leg or a wall.
 fn meets(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
     let wall = |to: f64, from: f64, slope: f64| ((to - from) / slope > 0.0).then(|| (to - from) / slope);
     let walls = [
@@ -40,7 +40,7 @@ fn meets(pose: &Pose, (dx, dy): (f64, f64), legs: &[(f64, f64, f64)]) -> f64 {
     walls.into_iter().chain(legs.iter().map(leg)).flatten().fold(f64::INFINITY, f64::min)
 }
 
-/// Fills in what a sensor at `pose` sees.
+/// Fills in the samples of a sensor at `pose`.
 fn see(sensor: &mut Sensor, pose: Pose) {
     let mut scan = Scan::of(ScanHead::lms(361, -90_000, 500, 1, 13), &[0; 361]);
     let ScanHead { first_angle, step, unit_um, .. } = **scan;
@@ -97,7 +97,7 @@ fn zones(verdict: Verdict, nearest_mm: u32, violated: [u8; 2]) -> Zones {
     zones
 }
 
-/// Two sensors, a person ahead, and one so near behind that the robot has to slow down.
+/// Returns a scene with two sensors, a person ahead, and one behind who is near enough to slow the robot down.
 pub(super) fn scene() -> Scene {
     let mut scene = Scene { hub_lives: true, hub_pid: 4711, hub_percent: Some(1.234), ..Scene::default() };
     let front = scene.sensor("front");
@@ -118,7 +118,7 @@ fn screen_held(scene: &Scene, held: Option<&Scene>, view: &View, (columns, rows)
     let mut terminal = Terminal::new(TestBackend::new(columns, rows)).unwrap();
     let mut view = view.clone();
     let drawn = terminal.draw(|frame| {
-        view.map = place_of_map(frame.area(), scene);
+        view.map = map_area(frame.area(), scene);
         view.fit(held.unwrap_or(scene));
         draw(frame, scene, held, &view);
     });
@@ -132,7 +132,7 @@ pub(super) fn text(buffer: &Buffer) -> String {
     rows.map(|cells| row(cells).trim_end().to_owned() + "\n").collect()
 }
 
-/// Compares `text` with what is kept in `file`, below the crate.
+/// Compares `text` with `file`, a path in this crate.
 fn compare(file: &str, text: &str) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
     if std::env::var_os("SCANHUB_GOLDEN").is_some_and(|order| order == "write") {
@@ -143,16 +143,16 @@ fn compare(file: &str, text: &str) {
 }
 
 #[test]
-fn the_robot_on_small_and_large_screens() {
-    let (scene, colours, plain) = (scene(), View::new(true), View::new(false));
-    compare("tests/watch/robot_60x20.txt", &text(&screen(&scene, &colours, (60, 20))));
-    compare("tests/watch/robot_120x40.txt", &text(&screen(&scene, &colours, (120, 40))));
+fn robot_on_small_and_large_screens() {
+    let (scene, colors, plain) = (scene(), View::new(true), View::new(false));
+    compare("tests/watch/robot_60x20.txt", &text(&screen(&scene, &colors, (60, 20))));
+    compare("tests/watch/robot_120x40.txt", &text(&screen(&scene, &colors, (120, 40))));
     compare("tests/watch/plain_60x20.txt", &text(&screen(&scene, &plain, (60, 20))));
     compare("tests/watch/plain_120x40.txt", &text(&screen(&scene, &plain, (120, 40))));
 }
 
 #[test]
-fn help_one_sensor_and_a_hub_that_went() {
+fn help_one_sensor_and_no_hub() {
     let mut scene = scene();
     let help = View { help: true, ..View::new(false) };
     compare("tests/watch/help_60x20.txt", &text(&screen(&scene, &help, (60, 20))));
@@ -163,9 +163,8 @@ fn help_one_sensor_and_a_hub_that_went() {
     compare("tests/watch/gone_60x20.txt", &text(&screen(&scene, &gone, (60, 20))));
 }
 
-/// A person who looks at a picture that stands still sees the verdict of now.
 #[test]
-fn a_held_picture_has_the_verdict_of_now() {
+fn frozen_picture_has_the_current_verdict() {
     let (held, mut now) = (scene(), scene());
     let view = View { paused: true, ..View::new(false) };
     let before = text(&screen(&held, &view, (60, 20)));
@@ -191,12 +190,11 @@ fn a_held_picture_has_the_verdict_of_now() {
     );
 }
 
-/// Light terminals and dark ones: nothing is painted in black or white, or on a colour; and without colours nothing is
-/// painted at all, but there are other signs.
+/// For light and dark terminals: no cell is black or white, or has a background color. Without colors, there are other signs.
 #[test]
-fn colours_are_those_of_the_terminal() {
+fn uses_the_colors_of_the_terminal() {
     let scene = scene();
-    let colours = screen(&scene, &View::new(true), (120, 40));
+    let colors = screen(&scene, &View::new(true), (120, 40));
     let plain = screen(&scene, &View::new(false), (120, 40));
     let used = |buffer: &Buffer| {
         let mut used: Vec<Color> = Vec::new();
@@ -209,7 +207,7 @@ fn colours_are_those_of_the_terminal() {
         used
     };
     assert_eq!(used(&plain), [Color::Reset]);
-    for colour in used(&colours) {
+    for color in used(&colors) {
         let may = [
             Color::Reset,
             Color::DarkGray,
@@ -220,19 +218,19 @@ fn colours_are_those_of_the_terminal() {
             Color::Yellow,
             Color::Green,
         ];
-        assert!(may.contains(&colour), "{colour}");
+        assert!(may.contains(&color), "{color}");
     }
-    let (colours, plain) = (text(&colours), text(&plain));
+    let (colors, plain) = (text(&colors), text(&plain));
     // The keys have an o and dots.
     let count =
         |text: &str, sign| text.lines().skip(1).take(35).flat_map(str::chars).filter(|c| *c == sign).count();
-    assert!(count(&plain, 'o') > 3 && count(&colours, 'o') == 0);
-    assert!(count(&plain, '*') == 2 && count(&colours, '*') == 2, "a mark of each sensor");
+    assert!(count(&plain, 'o') > 3 && count(&colors, 'o') == 0);
+    assert!(count(&plain, '*') == 2 && count(&colors, '*') == 2, "a mark of each sensor");
     assert!(plain.starts_with(" SLOW  rear, nearest 0.69 m") && plain.contains("1.00!"));
 }
 
 #[test]
-fn no_number_is_cut_on_a_narrow_screen() {
+fn truncates_no_number_on_a_narrow_screen() {
     let (scene, view) = (scene(), View::new(false));
     let of = |columns| text(&screen(&scene, &view, (columns, 20)));
     let whole = of(120);
@@ -251,7 +249,7 @@ fn no_number_is_cut_on_a_narrow_screen() {
 }
 
 #[test]
-fn no_screen_is_too_small() {
+fn draws_on_tiny_screens() {
     let scene = scene();
     for size in [(1, 1), (2, 3), (10, 2), (60, 4), (300, 5), (5, 60)] {
         for help in [false, true] {
@@ -261,13 +259,12 @@ fn no_screen_is_too_small() {
     }
 }
 
-/// The picture in the documents is what is drawn now.
 #[test]
-fn the_documents_show_it() {
+fn picture_in_the_documents_is_current() {
     compare("../../docs/watch.svg", &svg(&screen(&scene(), &View::new(true), (80, 30))));
 }
 
-/// A screen as SVG: letters where they stand, the dots of Braille as dots, because fonts have them at odd places.
+/// Returns a screen as SVG. Braille is drawn as dots, because their position depends on the font.
 fn svg(buffer: &Buffer) -> String {
     let (width, height) = (buffer.area.width * CELL.0, buffer.area.height * CELL.1);
     let mut svg = format!(
@@ -308,9 +305,9 @@ fn svg(buffer: &Buffer) -> String {
     svg + "</svg>\n"
 }
 
-/// The colours of a usual light terminal.
-fn ink(colour: Color) -> &'static str {
-    match colour {
+/// Returns the color in a typical light terminal.
+fn ink(color: Color) -> &'static str {
+    match color {
         Color::DarkGray => "#a0a0a0",
         Color::Magenta => "#d79ac6",
         Color::LightMagenta => "#b0208a",
@@ -324,13 +321,13 @@ fn ink(colour: Color) -> &'static str {
     }
 }
 
-/// Of a cell, in units of the picture.
+/// Size of a cell in the SVG.
 const CELL: (u16, u16) = (8, 16);
-/// Column and row of the dots, by their bits (Unicode 2800h to 28FFh).
+/// Column and row of each dot, in the order of the bits (Unicode 2800h to 28FFh).
 const BRAILLE: [(u16, u16); 8] = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3)];
 
 #[test]
-fn what_the_line_takes_away_is_seen_on_a_small_screen_too() {
+fn shows_loss_on_the_line_on_small_screens() {
     let mut scene = scene();
     let mut status = scene.sensor("rear").status.unwrap();
     status.counters[Counter::DueOnLine] = 1000;
@@ -345,7 +342,7 @@ fn what_the_line_takes_away_is_seen_on_a_small_screen_too() {
 }
 
 #[test]
-fn people_of_a_tracker_stand_in_the_picture_with_their_numbers_and_tails() {
+fn shows_people_with_their_ids_and_tails() {
     let (mut scene, view) = (scene(), View::new(true));
     let plain = screen(&scene, &view, (120, 40));
     let mut tracks = Tracks::default();
@@ -367,4 +364,80 @@ fn people_of_a_tracker_stand_in_the_picture_with_their_numbers_and_tails() {
     );
     let green = |buffer: &Buffer| buffer.content.iter().filter(|cell| cell.fg == Color::LightGreen).count();
     assert!(green(&plain) == 0 && green(&shown) > 5, "{} and {}", green(&plain), green(&shown));
+}
+
+#[test]
+fn shows_counters_the_pointer_and_line_features() {
+    let mut scene = scene();
+    let counters = View { counters: true, ..View::new(false) };
+    let page = text(&screen(&scene, &counters, (80, 40)));
+    for row in [
+        "damaged on the line, last 10 s          0.00 %",
+        "suspect                                      3",
+        "scanner_restarts                             0",
+    ] {
+        assert!(page.contains(row), "{row}:\n{page}");
+    }
+    assert!(page.lines().nth(1).unwrap().ends_with("         front          rear"), "{page}");
+
+    // The reading of the nearest point, or the position if there is none.
+    let front = scene.sensor("front").points().find(|point| point.beam == 180).unwrap();
+    let pointing = View { pointer_m: Some((front.x_m - 0.05, front.y_m)), ..View::new(false) };
+    let read = text(&screen(&scene, &pointing, (120, 40)));
+    assert!(read.contains("4.20 m from the robot, x 4.20  y 0.00 m, front: 0.00\u{b0}, 3.900 m"), "{read}");
+    let narrow = text(&screen(&scene, &pointing, (60, 20)));
+    assert!(narrow.contains("4.20 m from the robot") && !narrow.contains("front: 0.00"), "{narrow}");
+    let nowhere = View { pointer_m: Some((1.0, -2.0)), ..View::new(false) };
+    let read = text(&screen(&scene, &nowhere, (120, 40)));
+    assert!(read.contains("2.24 m from the robot, x 1.00  y -2.00 m\n") && read.contains('X'), "{read}");
+
+    let mut lines = Lines { count: 1, corners: 1, ..Lines::default() };
+    lines.line_array[0] = Line { x1_m: 1.0, y1_m: -1.0, x2_m: 1.0, y2_m: -3.0, ..Line::default() };
+    lines.corner_array[0] = Corner { x_m: 2.0, y_m: -2.0, ..Corner::default() };
+    scene.sensor("front").lines = Some(Box::new(lines));
+    let colored = |scene: &Scene, view: &View, color: Color| {
+        screen(scene, view, (120, 40)).content.iter().filter(|cell| cell.fg == color).count()
+    };
+    let (with, without) = (View { lines: true, ..View::new(true) }, View::new(true));
+    assert!(colored(&scene, &with, Color::LightBlue) > 10);
+    assert_eq!(colored(&scene, &without, Color::LightBlue), 0);
+    let crossings = |view: &View| text(&screen(&scene, view, (120, 40))).matches('+').count();
+    let bare = View { grid: false, ..View::new(true) };
+    // One + is part of the keys.
+    assert!(
+        crossings(&without) > 20 && crossings(&bare) == 1,
+        "{} {}",
+        crossings(&without),
+        crossings(&bare)
+    );
+}
+
+#[test]
+fn colors_show_intensities_and_trails() {
+    let mut scene = Scene { hub_lives: true, ..Scene::default() };
+    let sensor = scene.sensor("front");
+    let head =
+        ScanHead { intensity_bits: 8, contents: Contents::UPPER, ..ScanHead::lms(181, -90_000, 1000, 1, 13) };
+    let mut scan = Scan::of(head, &[4000; 181]);
+    for (n, value) in scan.arrays().upper.iter_mut().enumerate() {
+        *value = n as u8;
+    }
+    let mut found = Foreground::of(181);
+    found.begin(ForegroundHead { count: 181, ..ForegroundHead::default() }).bits[3] = 0xFF;
+    let header = |seq| Header { seq, ..Header::default() };
+    sensor.take_status(&Status::default());
+    sensor.take_scan(&header(1), &scan, 0);
+    sensor.take_foreground(&header(1), &found, 0);
+    let inks = |view: &View| {
+        let screen = screen(&scene, view, (120, 40));
+        [Color::Blue, Color::Cyan, Color::Green, Color::Yellow, Color::Magenta, Color::LightMagenta]
+            .map(|ink| screen.content.iter().filter(|cell| cell.fg == ink).count() > 0)
+    };
+    assert_eq!(
+        inks(&View::new(true)),
+        [true, true, true, true, false, true],
+        "the foreground is over its trail"
+    );
+    let plain = View { intensity: false, foreground: false, ..View::new(true) };
+    assert_eq!(inks(&plain), [false; 6]);
 }

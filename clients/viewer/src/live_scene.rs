@@ -1,0 +1,179 @@
+//! The scene of a running hub, as `watch` and `web` follow it: which topics, how samples and notices change the scene, and the CPU
+//! time of the hub.
+
+use std::collections::VecDeque;
+use std::rc::Rc;
+use std::time::{Duration, Instant};
+
+use scanhub_client::streams::Sample;
+use scanhub_client::{clock, live_topics};
+use scanhub_schema::{Maker, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::follow::Notice;
+use scanhub_verbs::names::TopicName;
+
+use crate::scene::Scene;
+
+/// Topics that every picture follows. The status is first, because it has the pose of its sensor. [`Topic::Lines`] costs the hub
+/// CPU time while it has a subscriber, so a picture only wants it while lines are looked at.
+pub(crate) const TOPICS: [Topic; 8] = [
+    Topic::Status,
+    Topic::Scan,
+    Topic::Marks,
+    Topic::Zones,
+    Topic::Foreground,
+    Topic::Background,
+    Topic::Lines,
+    Topic::Tracks,
+];
+
+/// Returns the topics in `wanted` of the named `sensors`, and the topics of every sensor. Without names, these are all sensors of
+/// a hub and all programs that publish. If a name belongs to a program, in the first live domain of `places`, the sensors are
+/// followed too.
+pub(crate) fn followed(
+    sensors: &[String],
+    wanted: &[Topic],
+    places: &[Domain],
+) -> (Vec<TopicName>, Vec<Topic>) {
+    let live = live_topics(places);
+    let maker = |sensor: &str| {
+        let is_live = |topic: &&Topic| live.contains(&format!("{sensor}/{}", topic.name()));
+        wanted.iter().find(is_live).map_or(Maker::Link, |topic| topic.maker())
+    };
+    let named = |sensor: &String| {
+        let maker = maker(sensor);
+        let of = wanted.iter().filter(move |topic| topic.maker() == maker);
+        of.map(|topic| TopicName { sensor: sensor.clone(), topic: *topic }).collect::<Vec<_>>()
+    };
+    let names: Vec<_> = sensors.iter().flat_map(named).collect();
+    let has_other = names.iter().any(|name| name.topic.maker() != Maker::Link);
+    let of_all = |topic: &&Topic| names.is_empty() || has_other && topic.maker() == Maker::Link;
+    let of_all = wanted.iter().filter(of_all).copied().collect();
+    (names, of_all)
+}
+
+/// The scene of a running hub.
+#[derive(Default)]
+pub(crate) struct LiveScene {
+    pub(crate) scene: Scene,
+    cpu: CpuUsage,
+}
+
+impl LiveScene {
+    /// Adds the sensor of a link's topic that will be followed.
+    pub(crate) fn begin(&mut self, name: &TopicName) {
+        if name.topic.maker() == Maker::Link {
+            self.scene.sensor(&name.sensor);
+        }
+    }
+
+    /// Takes a `sample` of `name`.
+    pub(crate) fn take(&mut self, name: &TopicName, sample: &Sample) {
+        if let Sample::Tracks(tracks) = sample {
+            return self.scene.take_tracks(&name.sensor, tracks, clock::now_ns());
+        }
+        let sensor = self.scene.heard(&name.sensor, sample.header());
+        match sample {
+            Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
+            Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
+            Sample::Zones(heard) => sensor.zones = heard.zones,
+            Sample::Foreground(found) => sensor.take_foreground(found.header(), found, clock::now_ns()),
+            Sample::Background(model) => sensor.background = Some(model.boxed()),
+            Sample::Lines(lines) => sensor.lines = Some(Box::new(**lines)),
+            Sample::Status(status) => sensor.take_status(status),
+            // Not part of any picture.
+            _ => {}
+        }
+    }
+
+    /// Takes a notice about the streams of `names`.
+    pub(crate) fn note(&mut self, names: &[Rc<TopicName>], notice: &Notice) {
+        match (notice, names) {
+            (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
+                self.scene.sensor(&name.sensor).lost += *missed;
+            }
+            (Notice::NoHub(_) | Notice::HubGone, _) => self.scene.hub_gone(),
+            (Notice::HubBack, _) => self.scene.hub_lives = true,
+            _ => {}
+        }
+    }
+
+    /// Deletes data that is too old. Returns whether there was any.
+    pub(crate) fn age(&mut self) -> bool {
+        self.scene.age(clock::now_ns())
+    }
+
+    /// Updates the CPU time of the hub. Returns whether it has changed.
+    pub(crate) fn measure_hub(&mut self, now: Instant) -> bool {
+        if self.scene.hub_pid == 0 {
+            return false;
+        }
+        let percent = self.cpu.measure(self.scene.hub_pid, now);
+        std::mem::replace(&mut self.scene.hub_percent, percent) != percent
+    }
+}
+
+/// CPU time of one process over the last seconds.
+#[derive(Debug, Default)]
+struct CpuUsage {
+    pid: u32,
+    /// Time of each measurement, and the CPU time until then in ns.
+    samples: VecDeque<(Instant, u64)>,
+}
+
+impl CpuUsage {
+    /// Measures process `pid`, at most once a second. Returns percent of one processor over the last five seconds, if known.
+    fn measure(&mut self, pid: u32, now: Instant) -> Option<f64> {
+        if self.pid != pid {
+            *self = CpuUsage { pid, samples: VecDeque::new() };
+        }
+        if self.samples.back().is_none_or(|(at, _)| now - *at >= INTERVAL) {
+            self.samples.push_back((now, used_ns(pid)?));
+            while self.samples.len() > SAMPLES {
+                self.samples.pop_front();
+            }
+        }
+        let ((first, before), (last, after)) = (self.samples.front()?, self.samples.back()?);
+        let span = last.duration_since(*first);
+        (!span.is_zero()).then(|| 100.0 * after.saturating_sub(*before) as f64 / span.as_nanos() as f64)
+    }
+}
+
+/// Returns the CPU time of `pid` in ns, user and system, including threads that have ended. `None` if it is not accessible.
+///
+/// The sum over the threads that live would be finer than a tick, but it falls when one of them ends.
+fn used_ns(pid: u32) -> Option<u64> {
+    let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The name before is in parentheses and may contain anything. User and system time are fields 14 and 15 (proc(5)).
+    let (_, fields) = text.rsplit_once(')')?;
+    let ticks = fields.split_whitespace().skip(11).take(2).map(|field| field.parse::<u64>().ok());
+    Some(ticks.sum::<Option<u64>>()? * TICK_NS)
+}
+
+/// Length of a clock tick in `/proc`: 100 per second on every Linux machine.
+const TICK_NS: u64 = 10_000_000;
+
+/// Minimum interval between measurements.
+const INTERVAL: Duration = Duration::from_secs(1);
+/// Number of measurements that are kept.
+const SAMPLES: usize = 6;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn measures_a_busy_process_and_no_other() {
+        let mut cpu = CpuUsage::default();
+        let (me, begin) = (std::process::id(), Instant::now());
+        assert_eq!(cpu.measure(me, begin), None, "one measurement has no span");
+        let before = used_ns(me).unwrap();
+        let mut sum = 0_u64;
+        // The kernel counts in ticks, so work until it has counted one.
+        while used_ns(me).unwrap() == before && begin.elapsed() < Duration::from_secs(20) {
+            sum = std::hint::black_box(sum + 1);
+        }
+        assert!(cpu.measure(me, begin + INTERVAL).unwrap() > 0.0);
+        assert_eq!(cpu.measure(u32::MAX, begin), None);
+    }
+}
