@@ -1,5 +1,5 @@
-//! `scanhub web --replay`: a hub of this process alone whose sensors are a recording, and the picture of it, with the keys of
-//! the player. Both end together.
+//! `scanhub web --replay`: a hub of this process alone whose sensors are a recording, and the picture of it, with the
+//! keys of the player. Both end together.
 
 use std::io::Write;
 use std::path::Path;

@@ -1,5 +1,5 @@
-//! The scene of a running hub, as `watch` and `web` follow it: which topics, how samples and notices change the scene, and the CPU
-//! time of the hub.
+//! The scene of a running hub, as `watch` and `web` follow it: which topics, how samples and notices change the scene,
+//! and the CPU time of the hub.
 
 use std::collections::VecDeque;
 use std::rc::Rc;
@@ -14,8 +14,8 @@ use scanhub_verbs::names::TopicName;
 
 use crate::scene::Scene;
 
-/// Topics that every picture follows. The status is first, because it has the pose of its sensor. [`Topic::Lines`] costs the hub
-/// CPU time while it has a subscriber, so a picture only wants it while lines are looked at.
+/// Topics that every picture follows. The status is first, because it has the pose of its sensor. [`Topic::Lines`]
+/// costs the hub CPU time while it has a subscriber, so a picture only wants it while it shows lines.
 pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Status,
     Topic::Scan,
@@ -27,9 +27,9 @@ pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Tracks,
 ];
 
-/// Returns the topics in `wanted` of the named `sensors`, and the topics of every sensor. Without names, these are all sensors of
-/// a hub and all programs that publish. If a name belongs to a program, in the first live domain of `places`, the sensors are
-/// followed too.
+/// Returns the topics in `wanted` of the named `sensors`, and the topics of every sensor. Without names, these are all
+/// sensors of a hub and all programs that publish. If a name belongs to a program, in the first live domain of
+/// `places`, the sensors are followed too.
 pub(crate) fn followed(
     sensors: &[String],
     wanted: &[Topic],
@@ -122,7 +122,8 @@ struct CpuUsage {
 }
 
 impl CpuUsage {
-    /// Measures process `pid`, at most once a second. Returns percent of one processor over the last five seconds, if known.
+    /// Measures process `pid`, at most once a second. Returns percent of one processor over the last five seconds, if
+    /// known.
     fn measure(&mut self, pid: u32, now: Instant) -> Option<f64> {
         if self.pid != pid {
             *self = CpuUsage { pid, samples: VecDeque::new() };
@@ -139,7 +140,8 @@ impl CpuUsage {
     }
 }
 
-/// Returns the CPU time of `pid` in ns, user and system, including threads that have ended. `None` if it is not accessible.
+/// Returns the CPU time of `pid` in ns, user and system, including threads that have ended. `None` if it is not
+/// accessible.
 ///
 /// The sum over the threads that live would be finer than a tick, but it falls when one of them ends.
 fn used_ns(pid: u32) -> Option<u64> {

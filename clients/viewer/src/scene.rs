@@ -1,6 +1,6 @@
-//! Contents of every picture of the robot: points in its frame, circles with their verdict, people, and the state of each
-//! sensor with rate, age and losses. The terminal and the browser draw the same scene, so they cannot disagree. Time is an
-//! argument.
+//! Contents of every picture of the robot: points in its frame, circles with their verdict, people, and the state of
+//! each sensor with rate, age and losses. The terminal and the browser draw the same scene, so they cannot disagree.
+//! Time is an argument.
 
 mod people;
 mod pointer;
@@ -64,8 +64,8 @@ impl Scene {
         &mut self.sensors[at]
     }
 
-    /// Returns the sensor from which a sample with this `header` arrived. A header proves that a hub runs, and names its process
-    /// unless the sensor is remote.
+    /// Returns the sensor from which a sample with this `header` arrived. A header proves that a hub runs, and names
+    /// its process unless the sensor is remote.
     pub fn heard(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
         if let Some(header) = header {
             self.hub_lives = true;
@@ -76,8 +76,8 @@ impl Scene {
         self.sensor(name)
     }
 
-    /// Takes people of the tracker `name` that arrived at `now_ns`, and the poses of the tracker's sensors. From then on, these
-    /// sensors are shown in its map, unless another tracker moves them.
+    /// Takes people of the tracker `name` that arrived at `now_ns`, and the poses of the tracker's sensors. From then
+    /// on, these sensors are shown in its map, unless another tracker moves them.
     pub fn take_tracks(&mut self, name: &str, tracks: &Tracks, now_ns: u64) {
         let at = self.trackers.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
             self.trackers.push((name.to_owned(), People::default()));
@@ -101,8 +101,8 @@ impl Scene {
         self.sensors.iter().any(|sensor| sensor.placement.is_in_map())
     }
 
-    /// Returns the sensors of the robot with their indices, or all sensors if the robot has none. Sensors of other machines are
-    /// on other robots.
+    /// Returns the sensors of the robot with their indices, or all sensors if the robot has none. Sensors of other
+    /// machines are on other robots.
     pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {
         let has_own = self.sensors.iter().any(|sensor| !is_remote(&sensor.name));
         self.sensors.iter().enumerate().filter(move |(_, sensor)| !has_own || !is_remote(&sensor.name))
@@ -133,8 +133,8 @@ impl Scene {
     }
 }
 
-/// Returns the worst verdict of `sensors`, the first sensor that has it, and the smallest distance of a point from the robot's
-/// center in mm. Without sensors, the verdict is unknown.
+/// Returns the worst verdict of `sensors`, the first sensor that has it, and the smallest distance of a point from the
+/// robot's center in mm. Without sensors, the verdict is unknown.
 pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Option<&'a str>, Option<u32>) {
     let (mut worst, mut nearest): (Option<(Verdict, &str)>, Option<u32>) = (None, None);
     for sensor in sensors {
@@ -174,8 +174,8 @@ impl Circle {
     }
 }
 
-/// Returns the circles of `sensors`, each once, in the order of the sensors. Sensors in a map have none, because the position of
-/// the robot's center in the map is unknown.
+/// Returns the circles of `sensors`, each once, in the order of the sensors. Sensors in a map have none, because the
+/// position of the robot's center in the map is unknown.
 pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
     let mut radii: Vec<(u16, bool)> = Vec::new();
     let on_robot = sensors.filter(|sensor| !sensor.placement.is_in_map());

@@ -1,6 +1,6 @@
-//! The web server: one page, and one WebSocket with the protocol `foxglove.sdk.v1`, so that the page and other viewers are
-//! clients of the same server. One thread serves all of them. A slow client gets the newest messages, and costs the others
-//! nothing.
+//! The web server: one page, and one WebSocket with the protocol `foxglove.sdk.v1`, so that the page and other viewers
+//! are clients of the same server. One thread serves all of them. A slow client gets the newest messages, and costs the
+//! others nothing.
 
 mod channels;
 mod connection;
@@ -37,7 +37,8 @@ const MAX_CONNECTIONS: usize = 64;
 const PORTS: u16 = 20;
 /// Size of the kernel's send buffer in bytes. It is small, because data in it grows old if the client is slow.
 const SEND_BUFFER: usize = 64 << 10;
-/// Time without accepting connections after descriptors ran out. Otherwise, the waiting connection would keep the thread busy.
+/// Time without accepting connections after descriptors ran out. Otherwise, the waiting connection would keep the
+/// thread busy.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 /// Minimum interval between two reports that no connection can be accepted.
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
@@ -107,8 +108,8 @@ impl Server {
         self.address
     }
 
-    /// Serves `channels`, and passes commands of viewers to the `player`, until `stop` is set and [`ChannelStore::wake`] is
-    /// called. Reports to `events`.
+    /// Serves `channels`, and passes commands of viewers to the `player`, until `stop` is set and
+    /// [`ChannelStore::wake`] is called. Reports to `events`.
     ///
     /// # Errors
     ///
@@ -158,8 +159,8 @@ impl Server {
         Ok(())
     }
 
-    /// Sleeps until something happens. Returns whether a connection can be accepted, and which connections can be read or
-    /// written.
+    /// Sleeps until something happens. Returns whether a connection can be accepted, and which connections can be read
+    /// or written.
     fn wait(
         &self,
         channels: &ChannelStore,
@@ -202,7 +203,8 @@ impl Server {
             if stream.set_nonblocking(true).is_err() {
                 continue;
             }
-            // At the limit, a client that has sent no request is disconnected, so that idle clients cannot block others.
+            // At the limit, a client that has sent no request is disconnected, so that idle clients cannot block
+            // others.
             if connections.len() >= MAX_CONNECTIONS {
                 let Some(silent) = connections.iter().position(Connection::is_silent) else { continue };
                 connections.remove(silent);

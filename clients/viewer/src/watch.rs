@@ -1,5 +1,5 @@
-//! `scanhub watch`: the live picture in the terminal. It sleeps until there is new data, limits the frame rate for slow lines, and
-//! restores the terminal however it ends.
+//! `scanhub watch`: the live picture in the terminal. It sleeps until there is new data, limits the frame rate for slow
+//! lines, and restores the terminal however it ends.
 
 mod draw;
 mod map;
@@ -48,8 +48,8 @@ const BYTES_PER_SECOND: f64 = 80_000.0;
 const MESSAGE_TIME: Duration = Duration::from_secs(4);
 
 impl WatchArgs {
-    /// Shows the picture of the first live domain of `places` on the terminal that `out` writes to, until the user quits, the
-    /// limits are reached or `stop` is set.
+    /// Shows the picture of the first live domain of `places` on the terminal that `out` writes to, until the user
+    /// quits, the limits are reached or `stop` is set.
     ///
     /// # Errors
     ///
@@ -252,8 +252,8 @@ impl Watcher<'_> {
     }
 }
 
-/// A request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, because a slow hub must not delay the
-/// picture. There is at most one at a time.
+/// A request to the hub to reset, freeze or thaw backgrounds. It runs in its own thread, because a slow hub must not
+/// delay the picture. There is at most one at a time.
 #[derive(Default)]
 struct BackgroundRequest {
     running: Option<JoinHandle<RequestOutcome>>,

@@ -1,5 +1,5 @@
-//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread follows the hub, and publishes
-//! on channels; another thread serves them.
+//! `scanhub web`: the live picture for browsers and for viewers of `foxglove.sdk.v1`. This thread follows the hub, and
+//! publishes on channels; another thread serves them.
 
 mod channels;
 mod feed;
@@ -38,12 +38,13 @@ pub struct WebArgs {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
-    /// Address to listen on: an IP address or localhost, a port, or both. 0.0.0.0 or :: for other machines, which needs --token. If the
-    /// port is in use, the next free one
+    /// Address to listen on: an IP address or localhost, a port, or both. 0.0.0.0 or :: for other machines, which needs
+    /// --token. If the port is in use, the next free one
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
     listen: SocketAddr,
-    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted, and other users
-    /// of this machine see it in the list of processes, unless it comes from the environment or --token-file
+    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted, and
+    /// other users of this machine see it in the list of processes, unless it comes from the environment or
+    /// --token-file
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = token)]
     token: Option<String>,
     /// File with the word as its only line, which only this user can read. It goes before --token
@@ -55,8 +56,8 @@ pub struct WebArgs {
     /// Accept viewers that are served from this URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
     origins: Vec<String>,
-    /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files: MCAP,
-    /// telegram stream or CARMEN log, plain or gzipped
+    /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files:
+    /// MCAP, telegram stream or CARMEN log, plain or gzipped
     #[arg(long, value_name = "FILE")]
     pub replay: Option<PathBuf>,
     /// Start the recording again at its end
@@ -77,8 +78,8 @@ const MAX_TOKEN_FILE: u64 = 4096;
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 impl WebArgs {
-    /// Serves the sensors of the first live domain of `places`, until the limits are reached or `stop` is set. Prints the URLs,
-    /// and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if there is one.
+    /// Serves the sensors of the first live domain of `places`, until the limits are reached or `stop` is set. Prints
+    /// the URLs, and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if there is one.
     ///
     /// # Errors
     ///
@@ -141,8 +142,8 @@ impl WebArgs {
     }
 }
 
-/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as does
-/// `localhost`.
+/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as
+/// does `localhost`.
 fn listen_address(text: &str) -> Result<SocketAddr, String> {
     let without_brackets = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
     if let Ok(address) = text.parse() {
@@ -190,8 +191,8 @@ fn read_token(file: &Path) -> Result<String, Failure> {
     })
 }
 
-/// Returns the URLs of the page. If the server listens on all addresses, they have the name of this machine, if it is known,
-/// and then each address in `reachable` of the same version of IP.
+/// Returns the URLs of the page. If the server listens on all addresses, they have the name of this machine, if it is
+/// known, and then each address in `reachable` of the same version of IP.
 fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&str>) -> Vec<String> {
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
     let of = |host: &dyn fmt::Display| format!("http://{host}/{token}");
@@ -207,8 +208,8 @@ fn urls(address: SocketAddr, reachable: &[IpAddr], host: &str, token: Option<&st
     if urls.is_empty() { vec![of(&address)] } else { urls }
 }
 
-/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them. Link-local
-/// IPv6 addresses are left out, because a browser needs the interface too.
+/// Returns the addresses by which other machines can reach this one. Empty if the system does not report them.
+/// Link-local IPv6 addresses are left out, because a browser needs the interface too.
 fn reachable_addresses() -> Vec<IpAddr> {
     let up = getifaddrs().into_iter().flatten().filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP));
     let addresses = up.filter_map(|entry| {
@@ -248,8 +249,8 @@ struct Reporter<'a> {
 }
 
 impl Reporter<'_> {
-    /// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the flags for
-    /// other machines, and with `--open` a warning.
+    /// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the
+    /// flags for other machines, and with `--open` a warning.
     fn ready(&mut self, urls: &[String], args: &WebArgs) -> Result<(), End> {
         #[derive(Serialize)]
         struct Ready<'a> {
@@ -286,7 +287,8 @@ impl Reporter<'_> {
         self.output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} {token}"))
     }
 
-    /// Prints why there is no hub to serve yet, and the command that reaches another one. With JSON, viewers alone get the reason.
+    /// Prints why there is no hub to serve yet, and the command that reaches another one. With JSON, viewers alone get
+    /// the reason.
     fn no_hub(&mut self, failure: &Failure) -> Result<(), End> {
         match self.json {
             true => Ok(()),

@@ -1,5 +1,5 @@
-//! A slow viewer and many connections cost the other viewers no message. The next message is published once all readers have the
-//! last one, so the test does not depend on the speed of the machine.
+//! A slow viewer and many connections cost the other viewers no message. The next message is published once all readers
+//! have the last one, so the test does not depend on the speed of the machine.
 
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -332,8 +332,8 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// Finds in the scene what is more than computation: samples and times are its arguments, so that a terminal and a browser show
-/// the same.
+/// Finds in the scene what is more than computation: samples and times are its arguments, so that a terminal and a
+/// browser show the same.
 pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
     const HARMLESS: [&str; 4] = ["std::collections", "std::iter", "std::mem", "std::time::Duration"];
     let is_harmless = |place: &String| HARMLESS.iter().any(|name| place.contains(name));
@@ -390,8 +390,8 @@ pub(crate) fn perception_only_computes(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// Finds in the web server what could reach a hub, a file or a process: input of strangers ends in it. It has an allowlist of
-/// crates and of modules, so that it cannot follow a hub through another module of its crate either.
+/// Finds in the web server what could reach a hub, a file or a process: input of strangers ends in it. It has an
+/// allowlist of crates and of modules, so that it cannot follow a hub through another module of its crate either.
 pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
     const CRATES: [&str; 9] = [
         "data-encoding",
@@ -420,8 +420,8 @@ struct Sources {
 
 const VIEWER: Sources = Sources { name: "scanhub-viewer", folder: "clients/viewer/src" };
 
-/// Finds what `module`, a file with a folder of the same name, names of its crate besides itself and `modules`, and which
-/// dependencies of the crate it names besides `crates`.
+/// Finds what `module`, a file with a folder of the same name, names of its crate besides itself and `modules`, and
+/// which dependencies of the crate it names besides `crates`.
 fn names_others(tree: &Tree, of: &Sources, module: &str, crates: &[&str], modules: &[&str]) -> Vec<String> {
     let manifest = &tree.members()[of.name];
     let others: Vec<String> = built_with(manifest)

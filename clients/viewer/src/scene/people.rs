@@ -41,8 +41,9 @@ pub struct Ellipse {
 }
 
 impl Ellipse {
-    /// Computes the ellipse of a normal distribution with this covariance in m2: xx, xy, yy. The axes are the eigenvectors. Their
-    /// length is the root of the eigenvalue times the 95 % quantile of chi-squared with two degrees of freedom.
+    /// Computes the ellipse of a normal distribution with this covariance in m2: xx, xy, yy. The axes are the
+    /// eigenvectors. Their length is the root of the eigenvalue times the 95 % quantile of chi-squared with two degrees
+    /// of freedom.
     pub fn of(covariance: [f32; 3]) -> Ellipse {
         let [xx, xy, yy] = covariance.map(f64::from);
         let (mean, half) = ((xx + yy) / 2.0, ((xx - yy) / 2.0).hypot(xy));
@@ -126,8 +127,8 @@ impl People {
     }
 }
 
-/// Returns the number of people in each room as text, sorted by name, with those outside all rooms at the end. `None` if there
-/// are no people.
+/// Returns the number of people in each room as text, sorted by name, with those outside all rooms at the end. `None`
+/// if there are no people.
 pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
     let mut rooms: Vec<_> = people.map(|person| person.room.as_deref()).collect();
     rooms.sort_by_key(|room| (room.is_none(), *room));

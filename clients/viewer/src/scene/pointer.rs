@@ -45,8 +45,8 @@ impl<'a> PointerPosition<'a> {
         self.x_m.hypot(self.y_m)
     }
 
-    /// Returns the lines of text about the position, the most important first: distance, coordinates, and for a point the sensor
-    /// with angle and range, and the intensity.
+    /// Returns the lines of text about the position, the most important first: distance, coordinates, and for a point
+    /// the sensor with angle and range, and the intensity.
     pub fn words(&self) -> Vec<String> {
         let mut words = vec![
             format!("{} m from the robot", fixed(self.distance_m(), 2)),

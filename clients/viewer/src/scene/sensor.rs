@@ -1,5 +1,5 @@
-//! One sensor of a scene: its last samples, where it is placed, the trail of its foreground, the rate and age of its scans, and
-//! why it sends none. Time is an argument.
+//! One sensor of a scene: its last samples, where it is placed, the trail of its foreground, the rate and age of its
+//! scans, and why it sends none. Time is an argument.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -122,8 +122,8 @@ impl Sensor {
         *self = Sensor { placement, background, lost, ..Sensor::new(&self.name) };
     }
 
-    /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of the intensity's share of
-    /// the highest one, because most points are dark.
+    /// Returns the brightness of a point with this `intensity`, from 0 to 1. It is the square root of the intensity's
+    /// share of the highest one, because most points are dark.
     pub fn shade(&self, intensity: u16) -> f64 {
         (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }

@@ -1,8 +1,8 @@
-//! Channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues, so
-//! memory does not depend on their number.
+//! Channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues,
+//! so memory does not depend on their number.
 //!
-//! A queue covers 250 ms: a server that was late for less still sends every message. A viewer that falls behind further skips
-//! to the newest message, so that it never shows old data.
+//! A queue covers 250 ms: a server that was late for less still sends every message. A viewer that falls behind further
+//! skips to the newest message, so that it never shows old data.
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -117,7 +117,8 @@ impl ChannelStore {
         self.channels().iter().enumerate().skip(from).map(|(at, one)| (at, one.channel.clone())).collect()
     }
 
-    /// Adds a subscriber. Returns the number of the last message that it does not get, or `None` if there is no such channel.
+    /// Adds a subscriber. Returns the number of the last message that it does not get, or `None` if there is no such
+    /// channel.
     pub(crate) fn subscribe(&self, id: usize) -> Option<u64> {
         let mut channels = self.channels();
         let one = channels.get_mut(id)?;
@@ -132,7 +133,8 @@ impl ChannelStore {
         }
     }
 
-    /// Returns the message after message `number`, or the newest one if that is no longer queued. `None` if there is none.
+    /// Returns the message after message `number`, or the newest one if that is no longer queued. `None` if there is
+    /// none.
     pub(crate) fn next(&self, id: usize, number: u64) -> Option<Queued> {
         let channels = self.channels();
         let queue = &channels.get(id)?.queue;
@@ -165,8 +167,8 @@ impl ChannelPublisher<'_> {
         self.store.channels()[self.id].subscribers > 0
     }
 
-    /// Queues a message of the time `wall_ns`, in nanoseconds since 1970. [`ChannelStore::wake_if_new`] wakes the server once for
-    /// all messages that were queued together.
+    /// Queues a message of the time `wall_ns`, in nanoseconds since 1970. [`ChannelStore::wake_if_new`] wakes the
+    /// server once for all messages that were queued together.
     pub fn publish(&self, wall_ns: u64, payload: &[u8]) {
         let one = &mut self.store.channels()[self.id];
         one.number += 1;

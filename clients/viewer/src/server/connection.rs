@@ -141,8 +141,8 @@ impl Connection {
         }
     }
 
-    /// Continues after a request whose head has `length` bytes. A WebSocket keeps the connection, so it needs no further
-    /// descriptor.
+    /// Continues after a request whose head has `length` bytes. A WebSocket keeps the connection, so it needs no
+    /// further descriptor.
     fn reply(
         &mut self,
         context: &ServerContext<'_>,

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::channels::Channel;
 use super::player::PlayerCommand;
 
-/// Subprotocols of the WebSocket, the preferred one first. The second is the former name of the same protocol. Some clients
-/// only know that name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
+/// Subprotocols of the WebSocket, the preferred one first. The second is the former name of the same protocol. Some
+/// clients only know that name (npm's `@foxglove/ws-protocol`, older versions of Lichtblick).
 pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
 /// Returns the first message of the server.
@@ -138,7 +138,8 @@ mod tests {
         }
     }
 
-    /// The expected messages were recorded from a server of PyPI's foxglove-sdk 0.30.3, with the same channel and message.
+    /// The expected messages were recorded from a server of PyPI's foxglove-sdk 0.30.3, with the same channel and
+    /// message.
     #[test]
     fn sends_the_same_as_the_foxglove_sdk() {
         let channel = Channel {

@@ -75,8 +75,8 @@ impl Request {
     }
 }
 
-/// Hosts, origins and token that a request must have. A page of another site cannot use a visitor's browser to connect, not
-/// even through DNS rebinding.
+/// Hosts, origins and token that a request must have. A page of another site cannot use a visitor's browser to connect,
+/// not even through DNS rebinding.
 #[derive(Clone, Debug, Default)]
 pub struct AccessPolicy {
     /// Token that the URL or a header must have, if one is set.
@@ -118,8 +118,8 @@ impl AccessPolicy {
         if is_known { Ok(()) } else { Err(Refusal::Token) }
     }
 
-    /// Returns whether `host` is this machine. An address cannot be made to point elsewhere, but a name can, so only names of
-    /// this machine are accepted.
+    /// Returns whether `host` is this machine. An address cannot be made to point elsewhere, but a name can, so only
+    /// names of this machine are accepted.
     fn is_here(&self, host: &str) -> bool {
         let name = match host.strip_prefix('[') {
             Some(rest) => rest.split(']').next().unwrap_or_default(),
@@ -157,7 +157,8 @@ impl Refusal {
     }
 }
 
-/// Returns a response that ends the connection. Other pages cannot show it, and browsers neither keep it nor guess its type.
+/// Returns a response that ends the connection. Other pages cannot show it, and browsers neither keep it nor guess its
+/// type.
 pub(crate) fn response(status: &str, kind: &str, policy: &str, body: &[u8]) -> Vec<u8> {
     let head = format!(
         "HTTP/1.1 {status}\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {}\r\nCache-Control: no-store\r\n\

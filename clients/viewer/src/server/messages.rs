@@ -1,5 +1,6 @@
-//! Messages for viewers, made from a scene and from samples: the channels, and the bytes of their messages. Scans and poses
-//! have the types of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict are JSON objects.
+//! Messages for viewers, made from a scene and from samples: the channels, and the bytes of their messages. Scans and
+//! poses have the types of ROS, which every viewer draws; circles and marks those of Foxglove; states and the verdict
+//! are JSON objects.
 
 mod scene_update;
 
@@ -57,8 +58,8 @@ pub fn cloud_channel(name: &str) -> Channel {
     of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
 }
 
-/// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later subscribers, because
-/// a message is valid for a limited time after its arrival.
+/// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later
+/// subscribers, because a message is valid for a limited time after its arrival.
 pub fn obstacles_channel(name: &str) -> Channel {
     Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
 }
@@ -73,8 +74,8 @@ pub fn status_channel(sensor: &str) -> Channel {
     json_channel(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
-/// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of people in
-/// each room as text. `problem` is why there is no hub.
+/// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of
+/// people in each room as text. `problem` is why there is no hub.
 pub fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
@@ -116,8 +117,8 @@ fn hub_words(scene: &Scene, domain: &str) -> String {
     format!("domain {domain}{pid}{load}")
 }
 
-/// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a simulator
-/// or a recording.
+/// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a
+/// simulator or a recording.
 pub fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]
     struct SensorState<'a> {

@@ -1,5 +1,5 @@
-//! The page: markup, style and script in one response, and the policy that lets a browser run only this script. Style and script
-//! are sent without comments and indentation.
+//! The page: markup, style and script in one response, and the policy that lets a browser run only this script. Style
+//! and script are sent without comments and indentation.
 
 use data_encoding::BASE64;
 use sha2::{Digest, Sha256};
@@ -99,7 +99,8 @@ mod tests {
         a.max(b) / a.min(b)
     }
 
-    /// WCAG 2.2, 1.4.3 and 1.4.11: text has 4.5 to 1, what is drawn and has a meaning 3 to 1, on the light page and the dark.
+    /// WCAG 2.2, 1.4.3 and 1.4.11: text has 4.5 to 1, what is drawn and has a meaning 3 to 1, on the light page and the
+    /// dark.
     #[test]
     fn what_is_written_and_drawn_can_be_seen() {
         assert!((contrast([0; 3], [255; 3]) - 21.0).abs() < 1e-9);

@@ -1,5 +1,5 @@
-//! One viewer at its WebSocket: its subscriptions, and the message that it gets next. Few bytes are in flight, so memory is
-//! bounded, and a viewer that was slow continues with the newest messages.
+//! One viewer at its WebSocket: its subscriptions, and the message that it gets next. Few bytes are in flight, so
+//! memory is bounded, and a viewer that was slow continues with the newest messages.
 
 use std::io;
 use std::net::TcpStream;
@@ -16,7 +16,8 @@ use super::player::Playback;
 const MAX_SUBSCRIPTIONS: usize = 256;
 /// Maximum length of a message from a viewer, in bytes: enough to subscribe to everything.
 const MAX_MESSAGE_LEN: usize = 64 << 10;
-/// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other viewers.
+/// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other
+/// viewers.
 const BATCH_SIZE: usize = 32;
 /// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
 const PIECE: usize = 16 << 10;
@@ -106,7 +107,8 @@ impl Viewer {
         self.pending.is_some()
     }
 
-    /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not count.
+    /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not
+    /// count.
     pub(crate) fn skipped(&self) -> u64 {
         self.skipped.by_viewer + self.skipped.by_server
     }

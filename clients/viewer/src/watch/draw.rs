@@ -1,5 +1,5 @@
-//! Draws a scene: the verdict as text, the picture or the counters, a line per sensor, and the keys. The same scene and view give
-//! the same cells.
+//! Draws a scene: the verdict as text, the picture or the counters, a line per sensor, and the keys. The same scene and
+//! view give the same cells.
 
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -13,7 +13,8 @@ use super::map::{DOTS, color, map};
 use super::view::View;
 use crate::scene::{PointerPosition, Scene, Sensor, rooms, verdict};
 
-/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`, but verdict and sensors are always those of `scene`.
+/// Draws `scene` as in `view`. If the picture is frozen, it shows `held`, but verdict and sensors are always those of
+/// `scene`.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
     let places = Places::of(frame.area(), scene);
     let heading = heading(scene, view, places.heading.width);
@@ -81,8 +82,8 @@ impl Places {
     }
 }
 
-/// Returns the verdict and the smallest distance as text, because not everyone can tell colors apart. A part that does not fit is
-/// omitted completely, because a truncated number is another number.
+/// Returns the verdict and the smallest distance as text, because not everyone can tell colors apart. A part that does
+/// not fit is omitted completely, because a truncated number is another number.
 fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     let shown = view.shown(scene);
     let (verdict, sensor, nearest) = verdict(shown.iter().map(|(_, sensor)| *sensor));
@@ -158,12 +159,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
             fields.extend([format!("  max {max_age} ms"), format!("  marks {}", dash(marks))]);
             fields.extend([format!("  objects {}", dash(objects)), format!("  background {known_beams}")]);
         }
-        for field in fields {
-            if text.chars().count() + field.chars().count() > usize::from(width) {
-                break;
-            }
-            text += &field;
-        }
+        append_fitting(&mut text, fields, "", usize::from(width));
     }
     let is_shown = view.only.is_none_or(|only| only == number);
     let mut style = if is_shown { Style::new() } else { Style::new().add_modifier(Modifier::DIM) };
@@ -173,8 +169,8 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
     Line::styled(text, style)
 }
 
-/// Returns the counters of the links for `area`: a heading, the shares of the line, and all counters, with a column for each of the
-/// `shown` sensors. Columns and rows that do not fit are omitted.
+/// Returns the counters of the links for `area`: a heading, the shares of the line, and all counters, with a column for
+/// each of the `shown` sensors. Columns and rows that do not fit are omitted.
 fn counters(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>> {
     let room = usize::from(area.width).saturating_sub(NAME_WIDTH) / COLUMN_WIDTH;
     let columns = &shown[..shown.len().min(room)];
@@ -219,22 +215,26 @@ fn scale_bar(dot_m: f64) -> String {
     format!("|{}| {length} m", "-".repeat(cells - 2))
 }
 
-/// Returns the text about the position of the pointer in at most `room` columns, or no text without a pointer. A part that does not fit is
-/// omitted completely.
+/// Returns the text about the position of the pointer in at most `room` columns, or no text without a pointer. A part
+/// that does not fit is omitted completely.
 fn pointer_text(scene: &Scene, view: &View, room: usize) -> String {
     let Some(at) = view.pointer_m else { return String::new() };
     let shown = view.shown(scene);
     let position = PointerPosition::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
-    let mut words = String::new();
-    for part in position.words() {
-        let between = if words.is_empty() { "" } else { ", " };
-        if words.chars().count() + between.len() + part.chars().count() > room {
+    let mut text = String::new();
+    append_fitting(&mut text, position.words(), ", ", room);
+    text
+}
+
+/// Appends `parts` with `between` before each but the first, until one does not fit in `room` columns.
+fn append_fitting(text: &mut String, parts: Vec<String>, between: &str, room: usize) {
+    for part in parts {
+        let between = if text.is_empty() { "" } else { between };
+        if text.chars().count() + between.len() + part.chars().count() > room {
             break;
         }
-        words += between;
-        words += &part;
+        text.extend([between, &part]);
     }
-    words
 }
 
 fn help(frame: &mut Frame<'_>, area: Rect) {

@@ -1,5 +1,5 @@
-//! The robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each color is replaced by
-//! another sign.
+//! The robot from above: points and figures of its sensors as Braille dots, with ahead up. Without colors, each color
+//! is replaced by another sign.
 
 use ratatui::style::Color;
 use ratatui::symbols::Marker;
@@ -54,8 +54,8 @@ struct Grid {
 }
 
 impl Grid {
-    /// Returns the position at which a sign is drawn in the cell of the point's dot. The canvas maps signs and dots to its axes in
-    /// different ways.
+    /// Returns the position at which a sign is drawn in the cell of the point's dot. The canvas maps signs and dots to
+    /// its axes in different ways.
     fn cell(&self, (x, y): (f64, f64)) -> (f64, f64) {
         let cell = |from_m: f64, dots: f64, cells: u16, length: f64| {
             let cell = ((from_m / self.dot_m).round() / dots).floor() + 0.25;

@@ -1,5 +1,5 @@
-//! The terminal of the picture: it is taken over at the start, and restored however the program ends. A frame is one write. Keys
-//! and the mouse are read without waiting.
+//! The terminal of the picture: it is taken over at the start, and restored however the program ends. A frame is one
+//! write. Keys and the mouse are read without waiting.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -124,7 +124,8 @@ fn size() -> Option<(u16, u16)> {
     tcgetwinsize(io::stdout()).ok().map(|size| (size.ws_col, size.ws_row))
 }
 
-/// Returns whether the terminal was closed. Not every program gets a signal then, and one that draws nothing has no failed write.
+/// Returns whether the terminal was closed. Not every program gets a signal then, and one that draws nothing has no
+/// failed write.
 fn hung_up() -> bool {
     let stdout = io::stdout();
     let mut ends = [PollFd::new(&stdout, PollFlags::empty())];
@@ -185,13 +186,14 @@ pub(super) enum Key {
     WheelDown(u16, u16),
 }
 
-/// Makes the terminal report where mouse buttons are pressed and dragged (xterm's mode 1002), without a maximum column (1006).
+/// Makes the terminal report where mouse buttons are pressed and dragged (xterm's mode 1002), without a maximum column
+/// (1006).
 const MOUSE_ON: &str = "\x1b[?1002h\x1b[?1006h";
 /// Ends these reports.
 const MOUSE_OFF: &str = "\x1b[?1006l\x1b[?1002l";
 
-/// Reads keys from stdin if it is a terminal, otherwise from the terminal of the process. Distinguishes a closed terminal from one
-/// where no key is pressed.
+/// Reads keys from stdin if it is a terminal, otherwise from the terminal of the process. Distinguishes a closed
+/// terminal from one where no key is pressed.
 struct Keys {
     terminal: File,
     typed: VecDeque<u8>,
@@ -233,8 +235,8 @@ impl Keys {
     }
 }
 
-/// Takes the first key from `typed`, and skips bytes without a meaning (ECMA-48, xterm). An incomplete sequence stays, because its
-/// end may arrive with the next bytes.
+/// Takes the first key from `typed`, and skips bytes without a meaning (ECMA-48, xterm). An incomplete sequence stays,
+/// because its end may arrive with the next bytes.
 fn next(typed: &mut VecDeque<u8>) -> Option<Key> {
     while let Some(&byte) = typed.front() {
         let key = match byte {

@@ -1,5 +1,6 @@
-//! Whole screens of a simulated scene: they are compared cell by cell with the files in `tests/watch`, and with the picture in the
-//! documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer watch::tests` writes the files again.
+//! Whole screens of a simulated scene: they are compared cell by cell with the files in `tests/watch`, and with the
+//! picture in the documents. To accept a change, `SCANHUB_GOLDEN=write cargo test -p scanhub-viewer watch::tests`
+//! writes the files again.
 
 use std::f64::consts::PI;
 use std::path::Path;
@@ -190,7 +191,8 @@ fn frozen_picture_has_the_current_verdict() {
     );
 }
 
-/// For light and dark terminals: no cell is black or white, or has a background color. Without colors, there are other signs.
+/// For light and dark terminals: no cell is black or white, or has a background color. Without colors, there are other
+/// signs.
 #[test]
 fn uses_the_colors_of_the_terminal() {
     let scene = scene();

@@ -138,8 +138,8 @@ impl View {
         None
     }
 
-    /// Fits the points into the picture, unless the user has moved it. If they fit already and the scale is about right, nothing
-    /// changes, because a picture that changes its scale often cannot be read.
+    /// Fits the points into the picture, unless the user has moved it. If they fit already and the scale is about
+    /// right, nothing changes, because a picture that changes its scale often cannot be read.
     pub(crate) fn fit(&mut self, scene: &Scene) {
         let dots = (f64::from(self.map.width.max(1)) * DOTS.0, f64::from(self.map.height.max(1)) * DOTS.1);
         let shown = self.shown(scene);
@@ -233,7 +233,8 @@ const STEP_DOTS: f64 = 8.0;
 const FIRST_DOT_M: f64 = 0.05;
 const FINEST_DOT_M: f64 = 0.001;
 const COARSEST_DOT_M: f64 = 1.0;
-/// Maximum distance of the center. It is more than the range of a sensor (82 m) beyond its maximum distance from the robot (100 m).
+/// Maximum distance of the center. It is more than the range of a sensor (82 m) beyond its maximum distance from the
+/// robot (100 m).
 const MAX_CENTER_M: f64 = 200.0;
 /// Minimum distance around the robot that is shown.
 const MIN_REACH_M: f64 = 0.5;

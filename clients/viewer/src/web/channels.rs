@@ -1,5 +1,5 @@
-//! Channels of sensors, mounts, and programs such as `tilt`: each is opened when its topics are followed, and publishes samples
-//! as messages.
+//! Channels of sensors, mounts, and programs such as `tilt`: each is opened when its topics are followed, and publishes
+//! samples as messages.
 
 use std::collections::BTreeMap;
 
@@ -54,7 +54,8 @@ impl<'a> SensorChannels<'a> {
         self.foreground_seq = Some(seq);
     }
 
-    /// Publishes the foreground of `seen` once the scan with the same `seq` has arrived, which has the angles of the beams.
+    /// Publishes the foreground of `seen` once the scan with the same `seq` has arrived, which has the angles of the
+    /// beams.
     pub(super) fn publish_foreground(&mut self, seen: &Sensor) {
         let Some(header) = self.scan_header.filter(|header| self.foreground_seq == Some(header.seq)) else {
             return;
@@ -88,7 +89,8 @@ impl<'a> SensorChannels<'a> {
     }
 }
 
-/// Channels of mounts, and of programs that publish sweeps. Angles and points are only followed while a viewer subscribes to them.
+/// Channels of mounts, and of programs that publish sweeps. Angles and points are only followed while a viewer
+/// subscribes to them.
 pub(super) struct TiltChannels<'a> {
     channels: &'a ChannelStore,
     mounts: BTreeMap<String, ChannelPublisher<'a>>,

@@ -19,8 +19,8 @@ use crate::scene::{Circle, Problem, Scene, Sensor, SensorPlacement, circles, ver
 use crate::server::player::{self, Playback, Progress};
 use crate::server::{ChannelPublisher, ChannelStore, messages};
 
-/// Interval at which the verdict is repeated. The page takes it as unknown after half a second, and a distance that changes with
-/// every scan cannot be read. A change is published at once.
+/// Interval at which the verdict is repeated. The page takes it as unknown after half a second, and a distance that
+/// changes with every scan cannot be read. A change is published at once.
 const ROBOT_INTERVAL: Duration = Duration::from_millis(90);
 /// Minimum interval between two messages of the player whose position alone has changed.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(50);
@@ -278,8 +278,8 @@ struct Overlay<'a> {
 }
 
 impl Overlay<'_> {
-    /// Returns whether a message is due. If so, starts the next interval. No message is due without a subscriber. The figures
-    /// change with every scan, so a later subscriber misses nothing.
+    /// Returns whether a message is due. If so, starts the next interval. No message is due without a subscriber. The
+    /// figures change with every scan, so a later subscriber misses nothing.
     fn take_due(&mut self, now: Instant) -> bool {
         let is_due = self.is_new && now >= self.publish_at && self.channel.is_subscribed();
         if is_due {

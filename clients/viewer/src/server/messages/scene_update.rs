@@ -1,5 +1,5 @@
-//! Circles, marks, line features, people and obstacles as `foxglove.SceneUpdate` in JSON. Each message has all entities of its
-//! channel. Viewers keep entities that are missing in the next message, so an entity has a lifetime of a second.
+//! Circles, marks, line features, people and obstacles as `foxglove.SceneUpdate` in JSON. Each message has all entities
+//! of its channel. Viewers keep entities that are missing in the next message, so an entity has a lifetime of a second.
 
 use scanhub_ros::BASE_FRAME;
 use scanhub_schema::{Header, Obstacle, Obstacles, Verdict};
@@ -13,8 +13,8 @@ pub(super) fn channel(topic: &str) -> Channel {
     json_channel(topic.to_owned(), "foxglove.SceneUpdate", include_str!("scene_update.json"))
 }
 
-/// Encodes the circles of the robot's sensors, each with its radius and verdict as metadata. For each sensor with points inside a
-/// circle, adds the beam of the nearest point.
+/// Encodes the circles of the robot's sensors, each with its radius and verdict as metadata. For each sensor with
+/// points inside a circle, adds the beam of the nearest point.
 pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let around = circles(scene.robot().map(|(_, sensor)| sensor));
     let mut entities = Vec::new();
@@ -46,8 +46,9 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     update(&entities)
 }
 
-/// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position in 95 of 100
-/// cases. The frame is the robot's; with a tracker, that is the map of the site. People who are not seen are pale.
+/// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position
+/// in 95 of 100 cases. The frame is the robot's; with a tracker, that is the map of the site. People who are not seen
+/// are pale.
 pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
         let (x, y) = person.position;
@@ -93,9 +94,10 @@ pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     update(&entities.collect::<Vec<_>>())
 }
 
-/// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The first entity
-/// has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`, and `words`, a summary
-/// as text. Sweeps end when the mount reverses, so each message deletes all earlier entities, and has its own lifetime.
+/// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The
+/// first entity has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`,
+/// and `words`, a summary as text. Sweeps end when the mount reverses, so each message deletes all earlier entities,
+/// and has its own lifetime.
 pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     let lifetime = || Time::of(lifetime_ns(header));
     let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };

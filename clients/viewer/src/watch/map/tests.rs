@@ -1,5 +1,5 @@
-//! Compares the picture in the terminal with the messages for a browser: both have the same points. The messages are read here
-//! as the page reads them.
+//! Compares the picture in the terminal with the messages for a browser: both have the same points. The messages are
+//! read here as the page reads them.
 
 use crate::server::messages;
 use scanhub_ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
