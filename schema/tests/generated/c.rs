@@ -171,6 +171,34 @@ pub(crate) fn above(indent: &str, comment: &str) -> String {
     lines.replace('\u{1}', " ")
 }
 
+/// Returns the sizes of arrays whose length depends on counts: those of a scan by its contents, and the segments.
+pub(crate) fn arrays(description: &Description) -> String {
+    let segments = rules::tail("Foreground").iter().find(|array| array.kind == "Segment").expect("segments");
+    let ranges =
+        (1 + rules::tail("Scan").iter().filter_map(|array| array.only_if).map(|(_, bit)| bit).sum::<u64>())
+            .next_power_of_two();
+    let mut text = format!(
+        "/* Segments that a foreground has room for. */\n#define SCANHUB_FOREGROUND_SEGMENTS {}\n\n\
+         /* Stands for the ranges, which every scan has, in addition to the bits of `contents`. */\n\
+         #define SCANHUB_SCAN_RANGES {ranges}u\n\n\
+         /* Bytes of a beam in the arrays of `contents` and SCANHUB_SCAN_RANGES. */\n\
+         static inline size_t scanhub_scan_width(unsigned contents)\n{{\n    return ",
+        segments.count
+    );
+    let contents = &description.sets["Contents"].values;
+    let widths = rules::tail("Scan").iter().map(|array| {
+        let name = match array.only_if {
+            Some((_, bit)) => {
+                contents.iter().find(|value| value.number == bit).expect("a bit").name.to_uppercase()
+            }
+            None => "RANGES".to_owned(),
+        };
+        format!("(contents & SCANHUB_SCAN_{name} ? {}u : 0u)", rules::number_size(array.kind))
+    });
+    text += &widths.collect::<Vec<_>>().join("\n        + ");
+    text + ";\n}\n"
+}
+
 /// Returns the checks with which a compiler that has another layout stops.
 pub(crate) fn checks(description: &Description) -> String {
     let mut text = String::new();

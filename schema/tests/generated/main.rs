@@ -115,7 +115,11 @@ fn recordings_are_described() {
 #[test]
 fn c_is_up_to_date() {
     let description = Description::read();
-    let blocks = [("structs", c::structs(&description)), ("checks", c::checks(&description))];
+    let blocks = [
+        ("structs", c::structs(&description)),
+        ("arrays", c::arrays(&description)),
+        ("checks", c::checks(&description)),
+    ];
     check_blocks("clients/c/include/scanhub/attach.h", &blocks);
     let payloads = [
         ("values", datagram_c::values(&description)),
