@@ -114,14 +114,14 @@ fn door(site: &Site, name: &str) -> Result<usize, Failure> {
 /// Name in the lines of a tracker that publishes nothing.
 const UNNAMED: &str = "people";
 
-type ScanJoin = Join<(Header, Box<Scan>), Box<Foreground>>;
+type StampedScan = (Header, Box<Scan>);
 
 struct TrackRun<'a> {
     args: &'a TrackArgs,
     places: &'a [Domain],
     tracker: PeopleTracker,
     /// Scans and foregrounds of each sensor of the site.
-    joins: Vec<ScanJoin>,
+    joins: Vec<Join<StampedScan, Box<Foreground>>>,
     late: LateReports,
     /// Whether a topic of a sensor has existed.
     is_subscribed: bool,
@@ -220,6 +220,7 @@ impl PictureWriter<'_> {
         let events = self.publish(picture);
         let PictureWriter { site, counted, passed, appeared, tracks, results, .. } = self;
         let (name, prints_all) = (results.name, counted.is_empty());
+        // Where everyone is would be too much text.
         if prints_all && results.is_json {
             let header = results.header;
             results.result(&json::tracks(name, &header, tracks), |_| Ok(()))?;
