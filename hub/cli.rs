@@ -11,10 +11,8 @@ mod doctor;
 mod examples;
 mod gateway;
 mod generated;
-mod key;
 mod latency;
 mod leds;
-mod listen;
 mod probe;
 pub(crate) mod record;
 pub(crate) mod replay;
@@ -28,6 +26,7 @@ use std::time::Duration;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use scanhub_config::Sources;
+use scanhub_network::{KeyArgs, ListenArgs, VerbOptions};
 use scanhub_perception::verbs::{SiteArgs, TiltArgs, TrackArgs};
 use scanhub_schema::{Failure, Family};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
@@ -43,10 +42,8 @@ pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
-pub(crate) use key::Key;
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
-pub(crate) use listen::Listen;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
@@ -100,6 +97,11 @@ impl Everywhere {
     /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
     pub(crate) fn publisher_domain(&self) -> Result<Domain, Failure> {
         scanhub_shm::publisher_domain(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+
+    /// Returns the options for a verb that reads them itself.
+    pub(crate) fn verb(&self) -> VerbOptions<'_> {
+        VerbOptions { domain: &self.domain, root: self.root.as_deref(), json: self.json }
     }
 
     /// The directories that may hold domains.
@@ -177,15 +179,15 @@ pub(crate) enum Verb {
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
     /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
-    #[command(after_help = gateway::groups())]
+    #[command(after_help = scanhub_network::groups_help())]
     Gateway(Gateway),
     /// Receive what gateways of other machines send, and show what was lost
-    #[command(after_help = listen::SIGNALS)]
-    Listen(Listen),
+    #[command(after_help = scanhub_network::LISTEN_SIGNALS)]
+    Listen(ListenArgs),
     /// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
     Bridge(Bridge),
     /// Make the key that gateways and listeners share
-    Key(Key),
+    Key(KeyArgs),
     /// Convert a recording to another format, or repair a damaged one
     #[command(after_help = convert::REPAIR)]
     Convert(Convert),

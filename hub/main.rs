@@ -178,11 +178,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Gateway(gateway) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            scanhub_network::gateway(&gateway.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            gateway.args()?.run(&everywhere.verb(), &mut out, &mut io::stderr(), &tell, &stop)
         }
         Verb::Listen(listen) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
-            scanhub_network::listen(&listen.options(everywhere)?, &mut out, &mut io::stderr(), &tell, &stop)
+            listen.run(&everywhere.verb(), &mut out, &mut io::stderr(), &tell, &stop)
         }
     }
 }

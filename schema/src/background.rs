@@ -316,9 +316,8 @@ impl Packed for Foreground {
         }
     }
 
-    fn unpack(&mut self, payload: &[u8]) -> bool {
-        let Some(len) = Foreground::room(payload) else { return false };
-        let Some(memory) = self.memory_mut().get_mut(..len) else { return false };
+    fn fill(&mut self, payload: &[u8], room: usize) -> bool {
+        let Some(memory) = self.memory_mut().get_mut(..room) else { return false };
         memory.fill(0);
         let Some((head, parts)) = PackedArrays::of(payload) else { return false };
         let ForegroundArrays { segments, bits, ranges } = self.begin(head);
@@ -328,11 +327,8 @@ impl Packed for Foreground {
         true
     }
 
-    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
-        Foreground::room(payload).is_some_and(|len| {
-            Foreground::grow(place, len);
-            place.unpack(payload)
-        })
+    fn make_room(place: &mut Box<Self>, room: usize) {
+        Foreground::grow(place, room);
     }
 }
 

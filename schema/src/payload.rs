@@ -16,7 +16,7 @@ pub trait Packed {
     /// Writes the payload to the start of `room`. Returns its length, or `None` if there is too little room.
     fn pack(&self, room: &mut [u8]) -> Option<usize>;
 
-    /// Returns the bytes of memory that the unpacked `payload` needs. `None` if it is shorter than its own counts
+    /// Returns the bytes of memory that `payload` fills. `None` if it is shorter than its own counts
     /// require or contradicts itself. Bytes after it belong to a later revision.
     fn room(payload: &[u8]) -> Option<usize>;
 
@@ -26,14 +26,31 @@ pub trait Packed {
         let _ = (limits, payload);
     }
 
+    /// Replaces the value by `payload`, for which [`room`](Self::room) returned `room`. Returns `false`, and leaves the
+    /// value undefined, if there is too little memory.
+    #[must_use]
+    fn fill(&mut self, payload: &[u8], room: usize) -> bool;
+
+    /// Gives `place` memory of `room` bytes if it has less.
+    fn make_room(place: &mut Box<Self>, room: usize) {
+        let _ = (place, room);
+    }
+
     /// Replaces the value by `payload`. Returns `false`, and leaves the value undefined, if `payload` has no
     /// [`room`](Self::room) or there is too little memory.
     #[must_use]
-    fn unpack(&mut self, payload: &[u8]) -> bool;
+    fn unpack(&mut self, payload: &[u8]) -> bool {
+        Self::room(payload).is_some_and(|room| self.fill(payload, room))
+    }
 
     /// Does the same as [`unpack`](Self::unpack), and makes `place` longer if it is too short.
     #[must_use]
-    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool;
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        Self::room(payload).is_some_and(|room| {
+            Self::make_room(place, room);
+            place.fill(payload, room)
+        })
+    }
 }
 
 /// A payload whose struct has a fixed size.
@@ -89,16 +106,14 @@ impl<P: FixedPayload> Packed for P {
     }
 
     fn room(payload: &[u8]) -> Option<usize> {
-        P::zeroed().unpack(payload).then_some(size_of::<P>())
+        let mut value = P::zeroed();
+        unpack_fields::<P>(bytes_of_mut(&mut value), payload).filter(|()| value.is_valid())?;
+        Some(size_of::<P>())
     }
 
-    fn unpack(&mut self, payload: &[u8]) -> bool {
+    fn fill(&mut self, payload: &[u8], _: usize) -> bool {
         *self = P::zeroed();
-        unpack_fields::<P>(bytes_of_mut(self), payload).is_some() && self.is_valid()
-    }
-
-    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
-        place.unpack(payload)
+        unpack_fields::<P>(bytes_of_mut(self), payload).is_some()
     }
 }
 
@@ -135,15 +150,12 @@ macro_rules! packed_as_is {
                 }
             }
 
-            fn unpack(&mut self, payload: &[u8]) -> bool {
-                $payload::packed_len(payload).is_some_and(|len| self.copy_from(&payload[..len]))
+            fn fill(&mut self, payload: &[u8], room: usize) -> bool {
+                self.copy_from(&payload[..room])
             }
 
-            fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
-                $payload::packed_len(payload).is_some_and(|len| {
-                    $payload::grow(place, len);
-                    place.copy_from(&payload[..len])
-                })
+            fn make_room(place: &mut Box<Self>, room: usize) {
+                $payload::grow(place, room);
             }
         }
     };
@@ -157,37 +169,45 @@ impl<'a> Datagram<'a> {
         Telegram::of(self.head.family, self.payload)
     }
 
-    /// Checks that the topic is known, and that the payload is valid for it.
+    /// Returns the announcement, if it is a valid one.
+    pub fn announce(&self) -> Option<Announce> {
+        let is_announcement = self.head.topic == Announce::NUMBER && self.is_versioned();
+        if is_announcement { Announce::unpack(self.payload) } else { None }
+    }
+
+    /// Returns whether it is a whole sample, and its payload has a revision.
+    fn is_versioned(&self) -> bool {
+        self.head.revision > 0 && self.head.parts == 1
+    }
+
+    /// Checks that the topic is known, and that the payload is valid for it. Returns the bytes of memory that the payload
+    /// fills, as [`Packed::room`] does. They are 0 for an announcement.
     ///
     /// # Errors
     ///
     /// Returns [`DatagramError::Skipped`] if this version does not have the topic, and [`DatagramError::Payload`] if
     /// the payload is not valid for it.
-    pub fn check_payload(&self) -> Result<(), DatagramError> {
-        let is_sound = match Topic::of_number(self.head.topic) {
-            None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
+    pub fn check_payload(&self) -> Result<usize, DatagramError> {
+        let room = match Topic::of_number(self.head.topic) {
+            None if self.head.topic == Announce::NUMBER => self.announce().map(|_| 0),
             None => return Err(DatagramError::Skipped),
-            Some(Topic::Telegram) => self.telegram().is_some(),
-            Some(topic) => is_sound(topic, self.payload),
+            Some(Topic::Telegram) => self.telegram().map(|telegram| telegram.bytes.len()),
+            Some(topic) => room(topic, self.payload),
         };
-        if is_sound && self.head.revision > 0 && self.head.parts == 1 {
-            Ok(())
-        } else {
-            Err(DatagramError::Payload)
-        }
+        room.filter(|_| self.is_versioned()).ok_or(DatagramError::Payload)
     }
 }
 
-macro_rules! check {
+macro_rules! rooms {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// Returns whether the payload is valid for `topic`.
-        fn is_sound(topic: Topic, payload: &[u8]) -> bool {
-            match topic { $(Topic::$topic => <crate::payload_type!($payload)>::room(payload).is_some(),)* }
+        /// Returns the bytes of memory that the payload of `topic` fills, or `None` if it is not valid.
+        fn room(topic: Topic, payload: &[u8]) -> Option<usize> {
+            match topic { $(Topic::$topic => <crate::payload_type!($payload)>::room(payload),)* }
         }
     };
 }
 
-crate::for_each_topic!(check);
+crate::for_each_topic!(rooms);
 
 impl Packed for [u8] {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
@@ -202,13 +222,14 @@ impl Packed for [u8] {
         limits.telegram = limits.telegram.max(payload.len());
     }
 
-    fn unpack(&mut self, payload: &[u8]) -> bool {
-        let Some(len) = <[u8]>::room(payload) else { return false };
-        self.get_mut(..len).map(|memory| memory.copy_from_slice(payload)).is_some()
+    fn fill(&mut self, payload: &[u8], room: usize) -> bool {
+        self.get_mut(..room).map(|memory| memory.copy_from_slice(&payload[..room])).is_some()
     }
 
-    fn unpack_into(place: &mut Box<[u8]>, payload: &[u8]) -> bool {
-        <[u8]>::room(payload).map(|_| *place = payload.into()).is_some()
+    fn make_room(place: &mut Box<[u8]>, room: usize) {
+        if place.len() != room {
+            *place = vec![0; room].into();
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! What has to hold whatever a network carries: datagrams are refused, or they say what can be said again.
 
-use scanhub_network::lan::{Fresh, GivenUp, ROWS, StreamStats};
+use scanhub_network::lan::{EvictedTotals, Fresh, GatewayTable, MAX_ROWS};
 use scanhub_schema::Topic;
 use scanhub_schema::datagram::{Announce, Datagram, DatagramError, HEAD, Head, MTU_ETHERNET, Packed};
 
@@ -10,7 +10,7 @@ use scanhub_schema::datagram::{Announce, Datagram, DatagramError, HEAD, Head, MT
 /// A piece begins with a byte and its length in two more. Odd: a header in short and a payload, to which a checksum is
 /// made; even: a datagram as it is.
 pub(crate) fn lan(data: &[u8]) {
-    let mut account = Box::new(StreamStats::new(&Topic::ALL));
+    let mut account = Box::new(GatewayTable::new(&Topic::ALL));
     let mut rest = data;
     let (mut given, mut accepted) = (0, 0);
     while let [mode, low, high, after @ ..] = rest {
@@ -29,7 +29,7 @@ pub(crate) fn lan(data: &[u8]) {
             Ok((datagram, fresh)) => {
                 accepted += 1;
                 assert_eq!(Datagram::read(bytes), Ok(datagram));
-                assert_eq!(datagram.check_payload(), Ok(()));
+                assert!(datagram.check_payload().is_ok());
                 can_be_said_again(&datagram);
                 is_seen_if_damaged(bytes, data);
                 assert_ne!(
@@ -48,17 +48,17 @@ pub(crate) fn lan(data: &[u8]) {
         }
     }
     let refused: u64 = DatagramError::ALL.iter().map(|&refusal| account.refused(refusal)).sum();
-    let given_up = account.given_up();
+    let given_up = account.evicted();
     let in_rows: u64 = account.rows().map(|row| row.received + row.duplicate).sum();
     let counted = in_rows + given_up.received + given_up.duplicate;
     assert_eq!((given, accepted), (counted + refused, counted));
-    assert!(account.rows().count() <= ROWS);
+    assert!(account.rows().count() <= MAX_ROWS);
 }
 
 /// Received, lost, duplicate and reordered of each row, and what was given up.
-fn figures(account: &StreamStats) -> (Vec<[u64; 4]>, GivenUp) {
+fn figures(account: &GatewayTable) -> (Vec<[u64; 4]>, EvictedTotals) {
     let rows = account.rows().map(|row| [row.received, row.lost(), row.duplicate, row.reordered]);
-    (rows.collect(), account.given_up())
+    (rows.collect(), account.evicted())
 }
 
 /// A datagram of few hubs, epochs and sensors, so that they meet.

@@ -7,7 +7,7 @@ use std::net::{Ipv4Addr, UdpSocket};
 use crate::testkit::{
     INT, KILL, Outcome, Receiver, TERM, TestEnv, hash, in_a_network, is_class, number, read, skip, until,
 };
-use scanhub_network::lan::StreamStats;
+use scanhub_network::lan::GatewayTable;
 use scanhub_schema::datagram::{Announce, Datagram, Packed};
 use scanhub_schema::{Scan, Topic, Verdict, Zones};
 use serde_json::{Value, json};
@@ -41,7 +41,7 @@ fn account(outcome: &Outcome) -> Vec<Value> {
 /// What was heard is exactly what the gateway says that it sent, topic by topic, and what it announced last.
 fn agrees(heard: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.code, Some(0), "{outcome}");
-    let mut ours = Box::new(StreamStats::new(&Topic::ALL));
+    let mut ours = Box::new(GatewayTable::new(&Topic::ALL));
     heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
     let lines = account(outcome);
     assert_eq!(ours.rows().count(), lines.len(), "{lines:#?}");

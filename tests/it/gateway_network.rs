@@ -10,7 +10,7 @@ use crate::testkit::{
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
-use scanhub_network::lan::{Row, StreamStats};
+use scanhub_network::lan::{GatewayTable, Row};
 use scanhub_schema::datagram::{Announce, Datagram};
 use scanhub_schema::{Background, Topic};
 use serde_json::Value;
@@ -62,7 +62,7 @@ fn first(heard: &[Vec<u8>], row: &Row) -> u64 {
 /// All numbers from the first one heard on were used once: what was not sent has failed.
 fn is_gap_free(heard: &[Vec<u8>], outcome: &Outcome) {
     assert_eq!(outcome.code, Some(0), "{outcome}");
-    let mut ours = Box::new(StreamStats::new(&Topic::ALL));
+    let mut ours = Box::new(GatewayTable::new(&Topic::ALL));
     heard.iter().for_each(|bytes| assert!(ours.receive(bytes, 1, 0).is_ok()));
     let lines = outcome.of_class("lan");
     for row in ours.rows() {

@@ -1,62 +1,110 @@
-//! `scanhub gateway`: what the hub publishes, as datagrams on a network, one message each and nothing sent twice. An
-//! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
+//! `scanhub gateway`: sends what the hub publishes as datagrams to a network, one sample each. It is an ordinary client that
+//! outlives the hub, its links and its own network, and it receives nothing from the network.
 
 mod host;
 mod network;
-mod report;
 mod udp_destination;
 mod uplink;
 
-use std::io::Write;
+use std::collections::BTreeMap;
+use std::io::{self, IsTerminal, Write};
+use std::net::SocketAddr;
 use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use clap::Args;
+use scanhub_schema::datagram::{Announce, GROUPS, MTU_SAFE, PORT, group};
+use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_shm::Domain;
+use scanhub_verbs::duration;
+use scanhub_verbs::follow::Notice;
+use scanhub_verbs::lossy_writer::LossyWriter;
+use scanhub_verbs::output::{End, Output, quiet};
+use serde::Serialize;
+
+use crate::forward::{self, Forwarder, Selection, begin_life};
 use crate::lan::Key;
 use crate::lan::outgoing::{ANNOUNCE_EVERY, Form};
-use scanhub_schema::{Failure, Kind};
-use scanhub_shm::Domain;
-
-use crate::forward::{Forwarder, Selection, begin_life};
-use crate::key_file;
-use crate::stamp;
-use network::Network;
-use report::Report;
-use scanhub_verbs::lossy_writer::LossyWriter;
-use scanhub_verbs::output::{End, quiet};
+use crate::{VerbOptions, key_file, now};
+use network::{Groups, Network};
+use udp_destination::{News, UdpDestination};
 use uplink::Uplink;
 
-/// What `gateway` is asked for.
-#[derive(Clone, Debug)]
-pub struct GatewayOptions {
-    /// The network interface of the groups; without one nothing goes to groups.
+/// Arguments of `scanhub gateway`. Those that are missing may come from section `gateway` of the configuration.
+#[derive(Args, Clone, Debug, Default)]
+pub struct GatewayArgs {
+    /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent to
+    /// groups, and --to must name hosts. lo: this machine only
+    #[arg(long, value_name = "NAME")]
     pub interface: Option<String>,
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it; none: the default topics of all
-    /// sensors, see [`Selection::is_default`].
+    /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
+    /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
+    /// all sensors]
+    #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     pub topics: Vec<String>,
-    /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
+    // Help for people, in which brackets are no link.
+    #[allow(rustdoc::broken_intra_doc_links)]
+    /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be repeated
+    #[arg(long, value_name = "HOST:PORT")]
     pub to: Vec<String>,
-    /// Telegrams and nothing else, without a header.
+    /// Send only telegrams, without a header, each sensor on its own port
+    #[arg(long, conflicts_with = "background_every")]
     pub bare: bool,
-    /// The file with the key of which every datagram gets a MAC.
+    /// Authenticate every datagram with the key in this file, for `listen --key-file`. `scanhub key new` creates one
+    #[arg(long, value_name = "FILE", conflicts_with = "bare")]
     pub key_file: Option<PathBuf>,
-    /// How many routers pass on what goes to the groups.
-    pub ttl: u8,
-    /// The background goes out so often, besides when it is a new one.
+    /// How many networks datagrams to the groups may cross, including the first one [default: 1]
+    #[arg(long, value_name = "N")]
+    pub ttl: Option<u8>,
+    /// Send the background also at this interval, not only when it is new, for example 10s
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     pub background_every: Option<Duration>,
-    /// The longest datagram, in bytes.
-    pub longest: usize,
-    /// How it tells of itself.
-    pub look: GatewayLook,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+    /// Longest datagram in bytes, up to 1472 if no tunnel is on the way [default: 1372]
+    #[arg(long, value_name = "BYTES")]
+    pub mtu: Option<usize>,
 }
 
-impl GatewayOptions {
-    /// What can be known without a network and without a hub: whether the topics are some, and go with the rest.
+impl GatewayArgs {
+    /// Sends until `stop` is set, even without hub or network. The counters go to `out` at the end and whenever `tell` is
+    /// set, and everything else to `notes` (stderr) if `out` is not JSON. Lines for which there is no room are dropped, so that a
+    /// slow reader delays only the end, by a second.
     ///
-    /// [`Kind::Usage`] with the topics that there are, else [`Kind::Configuration`].
+    /// # Errors
+    ///
+    /// Returns
+    ///
+    /// - [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is not a
+    ///   host, a value is not valid, or the key file contains no key of this user alone,
+    /// - [`Kind::Usage`] if there is no such topic,
+    /// - [`Kind::NoTopic`] if the first hub has no such sensor,
+    /// - [`Kind::Short`] if descriptors or memory are short,
+    /// - [`Kind::Interrupted`] if `stop` is set before all hosts are resolved.
+    pub fn run(
+        &self,
+        options: &VerbOptions<'_>,
+        out: &mut (impl Write + AsFd),
+        notes: &mut (impl Write + AsFd),
+        tell: &AtomicBool,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let display = match (options.json, out.as_fd().is_terminal()) {
+            (true, _) => Display::Json,
+            (false, true) => Display::Terminal,
+            (false, false) => Display::Lines,
+        };
+        let mut gateway = Gateway::open(self, &options.places()?, stop)?;
+        let (mut out, mut notes) = (LossyWriter::around(out, stop), LossyWriter::around(notes, stop));
+        let mut report = Report::new(display, &mut out, &mut notes);
+        quiet(gateway.run(&mut report, tell, stop))
+    }
+
+    /// Checks everything that needs neither network nor hub: the topics, and which options exclude each other.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] if a topic is not valid, otherwise [`Kind::Configuration`].
     pub fn check(&self) -> Result<(), Failure> {
         self.selection().map(drop)
     }
@@ -75,10 +123,10 @@ impl GatewayOptions {
     }
 }
 
-/// How a gateway tells of itself.
+/// Form of a gateway's output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum GatewayLook {
-    /// Lines at the begin, at the end and when asked.
+enum Display {
+    /// Lines at the start, at the end and on request.
     Lines,
     /// Objects, once a second.
     Json,
@@ -86,29 +134,8 @@ pub enum GatewayLook {
     Terminal,
 }
 
-/// Sends until `stop` is set, whatever becomes of the hub and of the network. The account goes to `out` at the end and
-/// whenever `tell` is set; what is no account to `notes` (stderr) if `out` is not JSON. Lines for which there is no room
-/// are left out: whoever does not read delays nothing but the end, and that by a second.
-///
-/// [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is no host,
-/// a value is not possible, or the key file holds no key of this user alone; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
-/// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
-/// where the hosts are.
-pub fn gateway(
-    options: &GatewayOptions,
-    out: &mut (impl Write + AsFd),
-    notes: &mut (impl Write + AsFd),
-    tell: &AtomicBool,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let mut gateway = Gateway::open(options, stop)?;
-    let (mut out, mut notes) = (LossyWriter::around(out, stop), LossyWriter::around(notes, stop));
-    let mut report = Report::new(options.look, &mut out, &mut notes);
-    quiet(gateway.run(&mut report, tell, stop))
-}
-
 struct Gateway<'a> {
-    options: &'a GatewayOptions,
+    args: &'a GatewayArgs,
     /// Of its key, if there is one.
     key_name: Option<String>,
     forwarder: Forwarder,
@@ -123,29 +150,29 @@ const HOSTS: &str = "hosts";
 const TICK: Duration = ANNOUNCE_EVERY;
 
 impl<'a> Gateway<'a> {
-    fn open(options: &'a GatewayOptions, stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
-        let selection = options.selection()?;
-        if options.interface.is_none() && options.to.is_empty() {
+    fn open(args: &'a GatewayArgs, places: &[Domain], stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
+        let selection = args.selection()?;
+        if args.interface.is_none() && args.to.is_empty() {
             return Err(uplink::nowhere());
         }
-        let key = options.key_file.as_deref().map(key_file::read).transpose()?;
-        let interface = options.interface.as_deref().map(Uplink::open).transpose()?;
-        let domain = options.places.first().map(Domain::name).unwrap_or_default();
+        let key = args.key_file.as_deref().map(key_file::read).transpose()?;
+        let interface = args.interface.as_deref().map(Uplink::open).transpose()?;
+        let domain = places.first().map(Domain::name).unwrap_or_default();
         let life = begin_life(domain, interface.as_ref().map_or(HOSTS, Uplink::name))?;
         let key_name = key.as_ref().map(Key::name);
         let form = match key {
             Some(key) => Form::Authenticated(key),
-            None if options.bare => Form::Bare,
+            None if args.bare => Form::Bare,
             None => Form::Sealed,
         };
-        let mut network =
-            Network::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
-        let forwarder = Forwarder::new(selection, &options.places, &mut network);
-        Ok(Gateway { options, key_name, forwarder, network, tick_at: Instant::now() })
+        let (ttl, longest) = (args.ttl.unwrap_or(1), args.mtu.unwrap_or(MTU_SAFE));
+        let mut network = Network::open(life, interface, &args.to, form, ttl, longest, stop)?;
+        let forwarder = Forwarder::new(selection, places, &mut network);
+        Ok(Gateway { args, key_name, forwarder, network, tick_at: Instant::now() })
     }
 
     fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        report.begin(&self.network, self.options.bare, self.key_name.as_deref())?;
+        report.begin(&self.network, self.args.bare, self.key_name.as_deref())?;
         if self.network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
             report.interface(&self.network)?;
         }
@@ -181,9 +208,9 @@ impl<'a> Gateway<'a> {
             return Ok(());
         }
         self.tick_at = now + TICK;
-        if let Some(every) = self.options.background_every {
+        if let Some(every) = self.args.background_every {
             let Network { outgoing, destinations, .. } = &mut self.network;
-            outgoing.repeat(every, stamp::now(), destinations);
+            outgoing.repeat(every, crate::now(), destinations);
         }
         self.announce();
         for destination in self.network.destinations.all_mut() {
@@ -202,6 +229,291 @@ impl<'a> Gateway<'a> {
 
     fn announce(&mut self) {
         let Network { outgoing, destinations, .. } = &mut self.network;
-        outgoing.announce(stamp::now(), destinations);
+        outgoing.announce(now(), destinations);
+    }
+}
+
+/// Where it is told.
+struct Report<'a> {
+    look: Display,
+    out: Output<'a>,
+    notes: Output<'a>,
+    /// Datagrams to the first destination, as of the last status line.
+    sent: u64,
+}
+
+impl<'a> Report<'a> {
+    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
+    fn new(look: Display, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+        Report { look, out: Output::new(out), notes: Output::new(notes), sent: 0 }
+    }
+
+    /// Who it is, where it sends, and of which key datagrams have a MAC.
+    fn begin(&mut self, network: &Network, bare: bool, key: Option<&str>) -> Result<(), End> {
+        let to: Vec<_> = network.destinations.copies.iter().map(|copy| copy.name.as_str()).collect();
+        if self.look == Display::Json {
+            return self.out.json(&Begin {
+                class: "gateway",
+                hub: id(network),
+                epoch: network.life.epoch,
+                interface: network.destinations.groups.as_ref().map(|groups| groups.interface.name()),
+                to,
+                bare,
+                key,
+                longest: network.outgoing.longest(),
+                renumbered: network.life.is_renumbered,
+            });
+        }
+        if network.life.is_renumbered {
+            self.notes.line(|line| write!(line, "{}: {RENUMBERED}", id(network)))?;
+        }
+        self.out.line(|line| {
+            write!(line, "gateway {} epoch {}", id(network), network.life.epoch)?;
+            if let Some(groups) = &network.destinations.groups {
+                write!(line, " on {}", groups.interface.name())?;
+            }
+            to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
+            write!(line, ", datagrams of {} bytes at most", network.outgoing.longest())?;
+            key.map_or(Ok(()), |key| write!(line, ", key {key}"))
+        })?;
+        if key.is_none() && !bare {
+            self.notes.line(|line| write!(line, "no key: {NO_KEY}"))?;
+        }
+        Ok(())
+    }
+
+    /// News of the hub.
+    fn hub(&mut self, notice: Notice) -> Result<(), End> {
+        self.wipe()?;
+        forward::tell(notice, self.look == Display::Json, &mut self.out, &mut self.notes)
+    }
+
+    /// The state of the interface became another one.
+    fn interface(&mut self, network: &Network) -> Result<(), End> {
+        let Some(Groups { interface, .. }) = &network.destinations.groups else { return Ok(()) };
+        match interface.is_up() {
+            true => self.link(interface.name(), "up", None),
+            false => self.link(interface.name(), "down", Some("no carrier, no IPv4 address, or not there")),
+        }
+    }
+
+    /// What became of a destination.
+    fn destination(&mut self, destination: &str, news: &News) -> Result<(), End> {
+        match news {
+            News::Failing(why) => self.link(destination, "failing", Some(why)),
+            News::Well => self.link(destination, "well", None),
+        }
+    }
+
+    /// The name of a destination has another address now, which is sent to.
+    fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), End> {
+        self.link(destination, "moved", Some(&format!("its address is now {address}")))
+    }
+
+    /// Samples of `topic` are longer than the longest datagram.
+    fn misfit(&mut self, topic: &str, longest: usize) -> Result<(), End> {
+        let message =
+            format!("does not fit into {longest} bytes: --mtu, or the interface's own, is too small");
+        self.link(topic, "failing", Some(&message))
+    }
+
+    /// The periodic word: an object for each sensor and topic and each destination, or one line on a terminal.
+    fn periodic(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
+        match self.look {
+            Display::Json => self.account(network),
+            Display::Lines => Ok(()),
+            Display::Terminal => self.draw(network, hub_lives),
+        }
+    }
+
+    /// The whole account.
+    fn account(&mut self, network: &Network) -> Result<(), End> {
+        self.wipe()?;
+        let json = self.look == Display::Json;
+        forward::account(&network.outgoing, &network.life, "lan", json, &mut self.out)?;
+        if network.outgoing.unfit() > 0 && self.look != Display::Json {
+            let longest = network.outgoing.longest();
+            self.out.line(|line| {
+                write!(line, "too long for {longest} bytes: {}, see --mtu", network.outgoing.unfit())
+            })?;
+        }
+        network.destinations.all().try_for_each(|destination| self.write_destination(network, destination))
+    }
+
+    fn write_destination(&mut self, network: &Network, destination: &UdpDestination) -> Result<(), End> {
+        let UdpDestination { name, sent, failed, reported, .. } = destination;
+        if self.look == Display::Json {
+            return self.out.json(&To {
+                class: "lan_to",
+                hub: id(network),
+                epoch: network.life.epoch,
+                to: name,
+                sent: *sent,
+                send_failed: *failed,
+                reported: *reported,
+            });
+        }
+        self.out.line(|line| write!(line, "to {name}: {sent} sent, {failed} failed, {reported} reported"))
+    }
+
+    fn link(&mut self, to: &str, state: &'static str, message: Option<&str>) -> Result<(), End> {
+        if self.look == Display::Json {
+            return self.out.json(&Link { class: "lan_link", to, state, message });
+        }
+        self.wipe()?;
+        self.notes.line(|line| match message {
+            Some(message) => write!(line, "{to}: {state}: {message}"),
+            None => write!(line, "{to}: {state}"),
+        })
+    }
+
+    fn draw(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
+        // A line that wraps would not be drawn over: it is cut.
+        let mut line = [WIPE, b"\x1b[?7l"].concat();
+        status(&mut line, network, hub_lives, self.sent)?;
+        line.extend(b"\x1b[?7h");
+        self.sent = first(network).0;
+        self.out.raw(&line)
+    }
+
+    fn wipe(&mut self) -> Result<(), End> {
+        match self.look {
+            Display::Terminal => self.out.raw(WIPE),
+            Display::Json | Display::Lines => Ok(()),
+        }
+    }
+}
+
+fn status(line: &mut Vec<u8>, network: &Network, hub_lives: bool, sent_before: u64) -> io::Result<()> {
+    let is_down = network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up());
+    let state = if is_down { " down" } else { "" };
+    let hub = if hub_lives { "" } else { "no hub, " };
+    let (sent, name) = first(network);
+    write!(line, "{hub}{name}{state}: {}/s", sent - sent_before)?;
+    for (number, destination) in network.destinations.all().enumerate() {
+        let UdpDestination { name, sent, failed, .. } = destination;
+        match number {
+            0 => write!(line, ", {sent} sent")?,
+            _ => write!(line, "; {name}: {sent} sent")?,
+        }
+        if number > 0 || *failed > 0 {
+            write!(line, ", {failed} failed")?;
+        }
+    }
+    let missed: u64 =
+        network.outgoing.account().flat_map(|sensor| sensor.used()).map(|(_, row)| row.missed).sum();
+    if missed > 0 {
+        write!(line, "; {missed} missed")?;
+    }
+    if network.outgoing.unfit() > 0 {
+        write!(line, "; {} too long", network.outgoing.unfit())
+    } else {
+        Ok(())
+    }
+}
+
+/// How many datagrams went to the first destination, which there always is, and its name.
+fn first(network: &Network) -> (u64, &str) {
+    network.destinations.all().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
+}
+
+fn id(network: &Network) -> String {
+    format!("{:016x}", network.life.hub)
+}
+
+/// Class `gateway`.
+#[derive(Serialize)]
+struct Begin<'a> {
+    class: &'static str,
+    hub: String,
+    epoch: u32,
+    interface: Option<&'a str>,
+    to: Vec<&'a str>,
+    bare: bool,
+    key: Option<&'a str>,
+    longest: usize,
+    renumbered: bool,
+}
+
+/// Class `lan_to`.
+#[derive(Serialize)]
+struct To<'a> {
+    class: &'static str,
+    hub: String,
+    epoch: u32,
+    to: &'a str,
+    sent: u64,
+    send_failed: u64,
+    reported: u64,
+}
+
+/// Class `lan_link`.
+#[derive(Serialize)]
+struct Link<'a> {
+    class: &'static str,
+    to: &'a str,
+    state: &'static str,
+    message: Option<&'a str>,
+}
+
+/// Why a gateway has another number than is kept.
+const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
+/// What a gateway without a key says once.
+const NO_KEY: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
+/// To the line's begin, and nothing on it (ECMA-48).
+const WIPE: &[u8] = b"\r\x1b[K";
+
+/// Returns the groups and their topics, for the end of the help.
+pub fn groups_help() -> String {
+    let mut text = format!("Groups, port {PORT}:\n");
+    for (address, topics) in groups_and_topics() {
+        text += &format!("  {address}  {topics}\n");
+    }
+    text + "bare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\nSIGUSR1: print the counts so far"
+}
+
+/// The address of each multicast group, and the names of the topics that are sent to it.
+fn groups_and_topics() -> Vec<(String, String)> {
+    let mut groups = BTreeMap::from([(Announce::GROUP, vec!["announce"])]);
+    for topic in Topic::ALL {
+        groups.entry(group(topic)).or_default().push(topic.name());
+    }
+    let [a, b, c] = GROUPS;
+    let row = |(last, topics): (u8, Vec<&str>)| (format!("{a}.{b}.{c}.{last}"), topics.join(", "));
+    groups.into_iter().map(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads a file of this repository, without line breaks, backquotes and the marks of doc comments.
+    fn words_of(path: &str) -> String {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
+        let text = std::fs::read_to_string(path).unwrap().replace(['`'], "").replace("///", "");
+        text.split_whitespace().collect::<Vec<_>>().join(" ")
+    }
+
+    #[test]
+    fn help_and_pages_name_the_topics_that_are_not_sent_by_default() {
+        let left_out: Vec<_> =
+            Topic::ALL.into_iter().filter(|topic| !Selection::is_default(*topic)).collect();
+        let names: Vec<_> = left_out.iter().map(|topic| topic.name()).collect();
+        let (last, first) = names.split_last().unwrap();
+        let sentence = format!("all topics except {} and {last}", first.join(", "));
+        let pages = ["docs/configuration.md", "docs/datagram.md", "docs/bridge.md"];
+        for path in pages.iter().chain(&["clients/network/src/gateway.rs", "clients/bridge/src/main.rs"]) {
+            assert!(words_of(path).contains(&sentence), "{path} does not say: {sentence}");
+        }
+    }
+
+    #[test]
+    fn help_lists_every_topic_with_its_group() {
+        let help = groups_help();
+        for (address, topics) in groups_and_topics() {
+            assert!(help.contains(&format!("{address}  {topics}\n")), "{help}");
+        }
+        let all: usize = groups_and_topics().iter().map(|(_, topics)| topics.split(", ").count()).sum();
+        assert_eq!(all, Topic::ALL.len() + 1);
     }
 }

@@ -1,11 +1,12 @@
-//! The file with the key that gateways and listeners share. It is created here, and read only if no other user can read it.
+//! `scanhub key`: creates the file with the key that gateways and listeners share. Both read it only if no other user can read it.
 
 use std::fs::File;
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::lan::Key;
+use clap::{Args, Subcommand};
 use rustix::rand::{GetRandomFlags, getrandom};
 use scanhub_files::output::{PRIVATE, Target, unwritable};
 use scanhub_files::regular;
@@ -14,12 +15,40 @@ use serde_json::json;
 
 use scanhub_verbs::output::{Output, quiet};
 
+/// Arguments of `scanhub key`.
+#[derive(Args, Debug)]
+pub struct KeyArgs {
+    #[command(subcommand)]
+    command: KeyCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum KeyCommand {
+    /// Make a file with a new key, readable for this user only
+    New {
+        /// The file; it must not exist
+        file: PathBuf,
+    },
+}
+
+impl KeyArgs {
+    /// Runs the command, which prints to `out`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Output`] if the file exists or cannot be written.
+    pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+        let KeyCommand::New { file } = &self.command;
+        new_key(file, json, out)
+    }
+}
+
 /// Creates the file at `path` with a new random key, for this user only, and prints the key's name to `out`.
 ///
 /// # Errors
 ///
-/// [`Kind::Output`] if there is a file already, or if it cannot be written.
-pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+/// Returns [`Kind::Output`] if the file exists or cannot be written.
+fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
     let mut bytes = [0; Key::LEN];
     let filled = getrandom(&mut bytes, GetRandomFlags::empty());
     if filled != Ok(Key::LEN) {

@@ -5,15 +5,24 @@
 //! clocks, sockets, files and threads out of this folder.
 
 pub mod address;
-mod gateway_runs;
+mod gateways;
 pub mod incoming;
 mod key;
 pub mod outgoing;
+mod reassembly;
 pub mod republish;
-mod stamp;
-mod stream_stats;
+mod senders;
+mod sequence;
 
-pub use gateway_runs::{Arrival, LIVES, Standing};
+pub use gateways::{Arrival, EvictedTotals, GatewayTable, MAX_EPOCHS, MAX_ROWS, MAX_RUNS, Standing};
 pub use key::Key;
-pub use stamp::Stamp;
-pub use stream_stats::{Fresh, GivenUp, ROWS, Row, StreamStats, WINDOW};
+pub use sequence::{Fresh, Row, WINDOW};
+
+/// A moment on two clocks, in ns.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stamp {
+    /// A clock that is never set, such as CLOCK_MONOTONIC.
+    pub monotonic_ns: u64,
+    /// The wall clock, since 1970.
+    pub wall_ns: u64,
+}

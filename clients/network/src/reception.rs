@@ -1,122 +1,122 @@
-//! What becomes of datagrams of other machines, by whatever network they came: each is refused or counted, and a new sample
-//! is written or published in this machine's domain. Tells what is wrong, each thing once. Refuses to know sockets.
+//! The receiving side of `listen` and of the bridge, whatever the network: each datagram is refused or counted, and a new
+//! sample is printed or published in this machine's domain. Each problem is reported once.
 
-mod crowd;
-mod duplicate_gateways;
 mod epochs;
 mod names;
 mod publish;
-mod received_topics;
-mod remote;
 mod report;
 
 use std::collections::HashMap;
 use std::net::IpAddr;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use crate::lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
-use crate::lan::{Key, Stamp};
 use scanhub_schema::datagram::{DatagramError, Head};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Topic};
 use scanhub_shm::{Domain, StateDirectory};
-
-use crate::interface::is_of_this_machine;
-use crate::stamp;
-use crowd::{Crowd, Crowding};
-use epochs::Epochs;
-use names::{Hubs, Names};
-use publish::Publication;
-pub use received_topics::received_topics;
-pub(crate) use report::Report;
-pub use report::Words;
 use scanhub_verbs::output::{End, Output};
 
-/// What is wanted of what comes.
+use crate::interface::is_of_this_machine;
+use crate::lan::address::Address;
+use crate::lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
+use crate::lan::republish::MAX_SENSORS;
+use crate::lan::{Key, MAX_ROWS, MAX_RUNS, Stamp};
+use crate::now;
+use epochs::Epochs;
+use names::Names;
+pub use names::received_topics;
+use publish::Publication;
+pub(crate) use report::Report;
+pub use report::Words;
+
+/// Settings of a receiver.
 pub struct Wanted<'a> {
-    /// The topics whose samples are, of all sensors.
+    /// Topics whose samples are received, of all sensors.
     pub topics: Vec<Topic>,
-    /// The topics whose announcements are believed: what does not come of the others is not lost.
+    /// Topics whose announcements are accepted. Samples of other topics are not lost if they do not arrive.
     pub heard: Vec<Topic>,
-    /// `NAME=HUB`: what to call a gateway, instead of its 16 hex digits.
+    /// Names of gateways, `NAME=HUB`, in place of their 16 hex digits.
     pub names: &'a [String],
-    /// The gateways to hear, by 16 hex digits or by one of `names`; none: all. What others send is passed over, before the
-    /// account.
+    /// Gateways to receive from, by 16 hex digits or by one of `names`; empty: all. Datagrams of others are ignored, and not
+    /// counted.
     pub hubs: &'a [String],
-    /// The key without which nothing is believed; none: everything is.
+    /// Key that datagrams are authenticated with. Without it, all datagrams are accepted.
     pub key: Option<Key>,
-    /// Where it keeps what has to survive it, if anywhere.
+    /// Directory of state that outlives the process, if there is one.
     pub state: Option<StateDirectory>,
-    /// Instead of writing samples, publish them in this domain, as `HUB.SENSOR`.
+    /// Domain in which samples are published as `HUB.SENSOR`, instead of being printed.
     pub publish: Option<&'a Domain>,
-    /// What the topics are made for that are published.
+    /// Limits of the published topics.
     pub limits: TopicLimits,
     /// Bytes of shared memory that all published topics may take together.
     pub memory: u64,
     /// Whether only sensors of gateways are published that have delivered for a second.
     pub only_proven: bool,
-    /// Only the account, no samples.
+    /// Whether only the counters are printed, and no samples.
     pub stats: bool,
 }
 
-/// Where a datagram came from, and when.
+/// Origin of a datagram.
 #[derive(Clone, Copy, Debug)]
-pub struct Origin {
+pub struct Origin<'a> {
     /// A number that no other sender has.
     pub sender: u64,
-    /// Its address, if the network tells that.
+    /// Address of the sender, if the network reports it.
     pub address: Option<IpAddr>,
-    /// When it came.
+    /// Name under which the network delivered the datagram, if it has names.
+    pub name: Option<Address<'a>>,
+    /// Time of its arrival.
     pub arrival: Stamp,
 }
 
-/// The receiving end of a network.
+/// Receiving end of a network.
 pub struct Reception<'a> {
-    wanted: Vec<Topic>,
+    topics: Vec<Topic>,
     is_quiet: bool,
-    hubs: Hubs,
     publication: Option<Publication>,
-    /// What was told that is wrong here.
-    told: Vec<String>,
+    /// Problems that were reported.
+    reported: Vec<String>,
     incoming: Incoming,
-    /// Where the epochs of gateways are kept that had the key, if there is one.
+    /// File with the epochs of gateways, if there is a key.
     epochs: Option<Epochs>,
-    crowd: Crowd,
+    capacity: CapacityReporter,
     pub(crate) report: Report<'a>,
-    /// When the last datagram came that was taken.
+    /// Time of arrival of the last datagram.
     taken: Stamp,
-    /// Samples that came and were wanted.
+    /// Samples that were received.
     pub received: u64,
-    /// When the last of them came.
+    /// Time of the last one.
     pub last_sample: Instant,
-    /// Where a sample is put together of its parts.
+    /// Datagrams that arrived under a name that is not their own.
+    pub foreign: u64,
+    /// Buffer for samples that come in parts.
     whole: Vec<u8>,
-    /// What could not be read of what was kept.
+    /// Error of reading the kept epochs, until it is reported.
     unreadable: Option<Failure>,
 }
 
-/// What is wrong where a datagram is of another version.
 const OTHER_VERSION: &str = "somebody sends datagrams of another version, which are refused: install the same version of \
                              scanhub on both machines";
-/// What is wrong where a datagram is of a topic that is not known here.
 const NEWER_TOPIC: &str = "somebody sends topics that this version does not know, which are left out: install the same \
                            version of scanhub on both machines";
-/// Message if a sensor does not fit into the memory that remote sensors may use.
 const NO_ROOM: &str = "samples of remote sensors were not published, because these need more shared memory than --memory \
                        allows: use a greater --memory; if someone invents sensors, use --key-file, or --hub to receive only \
                        those that it names";
-/// The most things that are told to be wrong: it may be the network that makes them.
-const TOLD: usize = 16;
+const CLOCK_AHEAD: &str = "a gateway has the key, and its clock is more than 5 s ahead of this machine's: it is not believed; \
+                           set the clocks";
+const CLOCK_BEHIND: &str = "a gateway has the key, and its clock is more than 5 s behind this machine's, or somebody sends \
+                            again what was recorded: it is not believed; set the clocks";
+/// Maximum number of problems that are reported. A sender may cause ever new ones.
+const MAX_REPORTED: usize = 16;
 
 impl<'a> Reception<'a> {
-    /// Opens the end for what is `wanted`; it tells to `out`, and what is no account to `notes` if that is not `json`, in these
-    /// `words`.
+    /// Opens a receiver. It prints to `out`, and everything but samples and counters to `notes` unless the output is `json`.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not possible, or too little memory is allowed for a sensor;
-    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, [`Kind::Short`](scanhub_schema::Kind) if there is
-    /// too little memory.
+    /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not valid or the memory is too small for a
+    /// sensor, [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, and
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory is short.
     pub fn open(
         wanted: Wanted<'_>,
         json: bool,
@@ -125,7 +125,7 @@ impl<'a> Reception<'a> {
         notes: Output<'a>,
     ) -> Result<Reception<'a>, Failure> {
         let names = Names::parse(wanted.names)?;
-        let hubs = Hubs::parse(wanted.hubs, &names)?;
+        let hubs = names.hubs(wanted.hubs)?;
         let open = |domain| {
             let publication = publish::open(domain, wanted.limits, wanted.memory)?;
             Ok(if wanted.only_proven { publication.only_proven() } else { publication })
@@ -142,169 +142,171 @@ impl<'a> Reception<'a> {
             None => Incoming::new(&wanted.heard),
         };
         Ok(Reception {
-            wanted: wanted.topics,
+            topics: wanted.topics,
             is_quiet: wanted.stats,
-            hubs,
             publication,
-            told: Vec::new(),
-            incoming,
+            reported: Vec::new(),
+            incoming: incoming.only(hubs),
             epochs,
-            crowd: Crowd::default(),
+            capacity: CapacityReporter::default(),
             report: Report::new(json, words, out, notes, names, key_name),
             taken: Stamp::default(),
             received: 0,
             last_sample: Instant::now(),
+            foreign: 0,
             whole: Vec::new(),
             unreadable,
         })
     }
 
-    /// Says what could not be read when it was opened.
+    /// Reports what could not be read when the receiver was opened.
     ///
     /// # Errors
     ///
-    /// As [`take`](Reception::take).
+    /// Returns the reason why output cannot be written.
     pub fn begin(&mut self) -> Result<(), End> {
-        match self.unreadable.take() {
-            Some(failure) => self.trouble(&failure.to_string()),
-            None => Ok(()),
-        }
+        self.unreadable.take().map_or(Ok(()), |failure| self.trouble(&failure.to_string()))
     }
 
-    /// Returns what is known of who sends.
-    pub fn incoming(&self) -> &Incoming {
-        &self.incoming
-    }
-
-    /// Takes `bytes`, a whole datagram. To be followed by [`wake`](Reception::wake) when nothing more waits.
+    /// Handles `bytes`, a whole datagram. Call [`wake`](Reception::wake) when no more are waiting.
     ///
     /// # Errors
     ///
-    /// If it cannot be told any more what came.
-    pub fn take(&mut self, bytes: &[u8], origin: Origin) -> Result<(), End> {
+    /// Returns the reason why output cannot be written.
+    pub fn take(&mut self, bytes: &[u8], origin: Origin<'_>) -> Result<(), End> {
         self.taken = origin.arrival;
-        if !self.hubs.want(bytes) {
-            return Ok(());
-        }
         let mut whole = std::mem::take(&mut self.whole);
-        let taken = self.arrived(bytes, origin, &mut whole);
+        let (name, sender) = (origin.name.as_ref(), origin.sender);
+        let arrived = self.incoming.receive_named(bytes, name, sender, origin.arrival, &mut whole);
+        let handled = self.arrived(arrived, origin.address);
         self.whole = whole;
-        taken?;
-        self.keep_epochs()
+        handled?;
+        // An epoch is new once in a run of a gateway.
+        match (self.incoming.take_epochs(), &self.epochs) {
+            (Some(known), Some(epochs)) => {
+                epochs.keep(&known).or_else(|failure| self.trouble(&failure.to_string()))
+            }
+            _ => Ok(()),
+        }
     }
 
-    /// Wakes the consumers of what was published.
+    /// Wakes the subscribers of the topics that were published.
     pub fn wake(&mut self) {
         if let Some(publication) = &mut self.publication {
             publication.wake();
         }
     }
 
-    /// Does what is due now and then; `more` may wait.
+    /// Does what is due regularly. `more` says whether datagrams may be waiting.
     ///
     /// # Errors
     ///
-    /// As [`take`](Reception::take).
+    /// Returns the reason why output cannot be written.
     pub fn look(&mut self, now: Instant, more: bool) -> Result<(), End> {
         if let Some(publication) = &mut self.publication {
-            let now = stamp::now();
+            let now = crate::now();
             publication.look(now.monotonic_ns, if more { self.taken } else { now });
         }
-        let so_far = self.crowding();
-        match self.crowd.look(so_far, now) {
-            Some(what) => self.report.trouble(&what),
-            None => Ok(()),
-        }
+        let (gateways, publication) = (self.incoming.gateways(), self.publication.as_ref());
+        let so_far = Evictions {
+            gateways: gateways.evicted().displaced,
+            refused: gateways.refused(DatagramError::Capacity),
+            sensors: publication.map_or(0, |publication| publication.displaced),
+            samples: publication.map_or(0, |publication| publication.left_out.capacity),
+        };
+        self.capacity.look(so_far, now).map_or(Ok(()), |what| self.report.trouble(&what))
     }
 
-    /// Tells the account so far; `others` are reasons for which something was refused before it came here.
+    /// Prints the counters. `others` are reasons for which datagrams were refused before they reached this receiver.
     ///
     /// # Errors
     ///
-    /// As [`take`](Reception::take).
+    /// Returns the reason why output cannot be written.
     pub fn tell(&mut self, others: &[(&'static str, u64)]) -> Result<(), End> {
-        self.report.stats(self.incoming.stats(), self.incoming.peers(), others)?;
-        self.publication.iter().try_for_each(|publication| self.report.publication(publication))
+        let gateways = self.incoming.gateways();
+        self.report.stats(gateways, others)?;
+        self.publication.iter().try_for_each(|publication| self.report.publication(publication, gateways))
     }
 
-    /// Draws the account on a terminal, over the one before.
+    /// Draws the counters on a terminal, over the previous ones.
     pub(crate) fn draw(&mut self) -> Result<(), End> {
-        self.report.draw(self.incoming.stats(), self.incoming.peers())
+        self.report.draw(self.incoming.gateways())
     }
 
-    /// Tells what is wrong here, once; of ever new things only the first ones.
+    /// Reports a problem once. Only the first few problems are reported.
     ///
     /// # Errors
     ///
-    /// As [`take`](Reception::take).
+    /// Returns the reason why output cannot be written.
     pub fn trouble(&mut self, what: &str) -> Result<(), End> {
-        if self.told.len() == TOLD || self.told.iter().any(|told| told == what) {
+        if self.reported.len() == MAX_REPORTED || self.reported.iter().any(|reported| reported == what) {
             return Ok(());
         }
-        self.told.push(what.to_owned());
+        self.reported.push(what.to_owned());
         self.report.trouble(what)
     }
 
-    fn arrived(&mut self, bytes: &[u8], origin: Origin, whole: &mut Vec<u8>) -> Result<(), End> {
-        let arrived = self.incoming.receive(bytes, origin.sender, origin.arrival, whole);
+    fn arrived(&mut self, arrived: Arrived<'_>, from: Option<IpAddr>) -> Result<(), End> {
         if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
-            // If a life of the same epoch went on until now, that was another sender's.
-            publication.begun(head, stamp::now());
+            // A run of the same epoch that was active until now was another gateway's.
+            publication.begun(head, now());
         }
         match arrived {
             Arrived::Sample(mut sample) => {
-                sample.announced = sample.announced.map(|announce| announce.only(&self.wanted));
-                self.sample(&sample, origin)
+                sample.announced = sample.announced.map(|announce| announce.only(&self.topics));
+                self.sample(&sample, from)
             }
             Arrived::Announced(mut announcement) => {
-                announcement.announce = announcement.announce.only(&self.wanted);
-                self.announced(&announcement, origin)
+                announcement.announce = announcement.announce.only(&self.topics);
+                self.announced(&announcement, from)
             }
-            Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub),
+            Arrived::Refused { shared: Some(hub), .. } => {
+                let what = duplicate_gateways(&self.report.names.of(hub));
+                self.trouble(&what)
+            }
             Arrived::Refused { why: DatagramError::Version, .. } => self.trouble(OTHER_VERSION),
             Arrived::Refused { why: DatagramError::Skipped, .. } => self.trouble(NEWER_TOPIC),
-            Arrived::Untimely { behind_ns } => self.trouble(untimely(behind_ns)),
-            Arrived::Refused { shared: None, .. } | Arrived::Part | Arrived::Known => Ok(()),
+            Arrived::Untimely { behind_ns } => {
+                self.trouble(if behind_ns < 0 { CLOCK_AHEAD } else { CLOCK_BEHIND })
+            }
+            Arrived::Foreign => {
+                self.foreign += 1;
+                Ok(())
+            }
+            Arrived::Refused { .. } | Arrived::Ignored | Arrived::Part | Arrived::Known => Ok(()),
         }
     }
 
-    /// Keeps the epochs of gateways that had the key, if one is new: once in a life of a gateway.
-    fn keep_epochs(&mut self) -> Result<(), End> {
-        let kept = match (self.incoming.take_epochs(), &self.epochs) {
-            (Some(known), Some(epochs)) => epochs.keep(known),
-            _ => return Ok(()),
-        };
-        kept.or_else(|failure| self.trouble(&failure.to_string()))
-    }
-
-    /// A sample that was not there before.
-    fn sample(&mut self, sample: &RemoteSample<'_>, origin: Origin) -> Result<(), End> {
+    /// Publishes or prints a new sample.
+    fn sample(&mut self, sample: &RemoteSample<'_>, from: Option<IpAddr>) -> Result<(), End> {
         let RemoteSample { remote, missed, .. } = sample;
-        let (head, topic) = (&remote.datagram.head, remote.topic);
-        if !self.wanted.contains(&topic) {
+        let (head, topic) = (&remote.head, remote.topic);
+        if !self.topics.contains(&topic) {
             return Ok(());
         }
         self.received += 1;
         self.last_sample = Instant::now();
         if let Some(publication) = &mut self.publication {
-            let made = publication.sample(sample, || self.report.names.of(head.hub), stamp::now());
-            if publication.left_out.no_room > 0 {
+            let no_room = publication.left_out.no_room;
+            let made = publication.sample(sample, || self.report.names.of(head.hub), now());
+            if publication.left_out.no_room > no_room {
+                self.incoming.count_no_room(head.hub);
                 self.trouble(NO_ROOM)?;
             }
-            return self.made(head, made, origin);
+            return self.published(head, made, from);
         }
         if self.is_quiet {
             return Ok(());
         }
-        let sensor = &self.incoming.written(head);
+        let sensor = &self.incoming.printed_name(head);
         if *missed > 0 {
             self.report.missed(head, sensor, topic, *missed)?;
         }
         self.report.sample(sensor, remote)
     }
 
-    /// A sensor was announced, in newer words than before.
-    fn announced(&mut self, announcement: &Announcement, origin: Origin) -> Result<(), End> {
+    /// Handles an announcement that is newer than all others of its sensor.
+    fn announced(&mut self, announcement: &Announcement, from: Option<IpAddr>) -> Result<(), End> {
         let Announcement { head, announce, is_named, behind_ns, .. } = announcement;
         if *is_named {
             self.report.named(head, announce.sensor())?;
@@ -313,53 +315,101 @@ impl<'a> Reception<'a> {
             self.report.clocks_differ(head, *behind_ns)?;
         }
         let Some(publication) = &mut self.publication else { return Ok(()) };
-        let made = publication.announced(announcement, &self.report.names.of(head.hub), stamp::now());
-        self.made(head, made, origin)
+        let made = publication.announced(announcement, &self.report.names.of(head.hub), now());
+        self.published(head, made, from)
     }
 
-    /// What became of the topics of the sensor that sent `head`: they may have been `made` just now.
-    fn made(
+    /// Reports that the topics of the sensor that sent `head` were created just now, or why they could not be.
+    fn published(
         &mut self,
         head: &Head,
         made: Result<Option<String>, Failure>,
-        origin: Origin,
+        from: Option<IpAddr>,
     ) -> Result<(), End> {
         match made {
-            Ok(Some(name)) => {
-                let is_here = origin.address.is_some_and(is_of_this_machine);
-                self.report.published(head, &name, is_here)
-            }
+            Ok(Some(name)) => self.report.published(head, &name, from.is_some_and(is_of_this_machine)),
             Ok(None) => Ok(()),
             Err(failure) => self.trouble(&failure.to_string()),
         }
     }
+}
 
-    /// Two gateways send as `hub`, and what one of them sends is refused.
-    fn is_shared(&mut self, hub: u64) -> Result<(), End> {
-        let what = duplicate_gateways::remedy(&self.report.names.of(hub));
-        self.trouble(&what)
-    }
+/// Returns the report of two gateways that send as `hub`.
+fn duplicate_gateways(hub: &str) -> String {
+    format!(
+        "two gateways send as {hub}, and what one of them sends is refused: was one machine made from a copy of the \
+         other's disk? Remove the files gateway-* in the state directory of one of them \
+         (~/.local/state/scanhub, or what XDG_STATE_HOME or its service says) and start its gateway again"
+    )
+}
 
-    fn crowding(&self) -> Crowding {
-        let publication = self.publication.as_ref();
-        Crowding {
-            gateways: self.incoming.stats().given_up().displaced,
-            refused: self.incoming.stats().refused(DatagramError::Capacity),
-            sensors: publication.map_or(0, |publication| publication.displaced),
-            samples: publication.map_or(0, |publication| publication.left_out.capacity),
+/// Evictions since the start, and refusals because there was no room.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Evictions {
+    /// Gateways that were evicted for others.
+    gateways: u64,
+    /// Datagrams that were refused.
+    refused: u64,
+    /// Published sensors that were evicted for others.
+    sensors: u64,
+    /// Samples of sensors that were not published.
+    samples: u64,
+}
+
+/// Reports at the first eviction, and then from time to time, how many there were. Someone may cause them a thousand times a
+/// second.
+#[derive(Default)]
+struct CapacityReporter {
+    reported: Evictions,
+    reported_at: Option<Instant>,
+}
+
+/// Minimum time between two reports.
+const REPORT_INTERVAL: Duration = Duration::from_secs(60);
+
+impl CapacityReporter {
+    /// Returns the next report, if one is due.
+    fn look(&mut self, so_far: Evictions, now: Instant) -> Option<String> {
+        let is_recent = self.reported_at.is_some_and(|at| now - at < REPORT_INTERVAL);
+        if so_far == self.reported || is_recent {
+            return None;
         }
+        let before = std::mem::replace(&mut self.reported, so_far);
+        let parts = [
+            (so_far.gateways - before.gateways, "gateways were given up for others"),
+            (so_far.refused - before.refused, "datagrams of others were refused"),
+            (so_far.sensors - before.sensors, "published sensors were put out for others"),
+            (so_far.samples - before.samples, "samples of other sensors were not published"),
+        ];
+        let parts = parts.iter().filter(|(count, _)| *count > 0);
+        let parts: Vec<_> = parts.map(|(count, what)| format!("{count} {what}")).collect();
+        self.reported_at = Some(now);
+        Some(format!(
+            "more is sent than there is room for ({MAX_RUNS} gateways, {MAX_ROWS} of their sensors and topics; {MAX_SENSORS} \
+             published sensors): {}; gateways that are known to deliver stay. If somebody invents them, use --hub to receive \
+             only those that it names",
+            parts.join(", ")
+        ))
     }
 }
 
-/// What is wrong where an announcement has the key and is not believed; in so few words that it is told once.
-fn untimely(behind_ns: i64) -> &'static str {
-    match behind_ns < 0 {
-        true => {
-            "a gateway has the key, and its clock is more than 5 s ahead of this machine's: it is not believed; set the clocks"
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reports_at_once_and_then_once_a_minute() {
+        let (mut capacity, begin) = (CapacityReporter::default(), Instant::now());
+        let mut reported = Vec::new();
+        for n in 0..180_000_u64 {
+            // Nothing happens in the second minute.
+            let gateways = n.min(60_000) + n.saturating_sub(120_000);
+            let so_far = Evictions { gateways, ..Evictions::default() };
+            if let Some(line) = capacity.look(so_far, begin + Duration::from_millis(n)) {
+                assert!(line.contains(" gateways were given") && !line.contains("samples"), "{line}");
+                reported.push(n);
+            }
         }
-        false => {
-            "a gateway has the key, and its clock is more than 5 s behind this machine's, or somebody sends again what was \
-             recorded: it is not believed; set the clocks"
-        }
+        assert_eq!(reported, [1, 60_001, 120_001]);
     }
 }

@@ -4,7 +4,7 @@
 #[path = "../../../tests/it/lan/vectors.rs"]
 mod vectors;
 
-use scanhub_network::lan::{Fresh, StreamStats};
+use scanhub_network::lan::{Fresh, GatewayTable};
 use scanhub_schema::Topic;
 use scanhub_schema::datagram::{Datagram, DatagramError, HEAD, Head, MTU_SAFE};
 use vectors::{Vector, bytes, vectors};
@@ -17,7 +17,7 @@ fn receiver_accepts_or_refuses_them() {
         if says["with_key"] == true {
             continue;
         }
-        let mut stats = StreamStats::new(&Topic::ALL);
+        let mut stats = GatewayTable::new(&Topic::ALL);
         for before in says["after"].as_array().into_iter().flatten() {
             stats.receive(&bytes(before.as_str().unwrap()), 1, 0).unwrap();
         }

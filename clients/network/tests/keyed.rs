@@ -220,6 +220,7 @@ fn the_receiving_end_makes_of_them_what_the_list_says() {
             // An announcement that was overtaken says nothing new, and is no duplicate.
             Arrived::Known if step.outcome == "taken" => "taken",
             Arrived::Known => "duplicate",
+            Arrived::Ignored | Arrived::Foreign => "ignored",
         };
         assert_eq!(outcome, step.outcome, "{}", step.name);
     }

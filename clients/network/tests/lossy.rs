@@ -135,9 +135,9 @@ impl Judged {
             Arrived::Sample(sample) => {
                 assert!(is_new, "no sample comes twice");
                 let sent = was_sent.iter().flatten().flat_map(|part| &part[HEAD..]);
-                assert!(sent.eq(sample.remote.datagram.payload), "no sample is half of one");
-                let zones = sample.remote.payload::<Zones>();
+                assert!(sent.eq(sample.remote.payload.bytes), "no sample is half of one");
                 let is_zones = sample.remote.topic == Topic::Zones && !sample.remote.late;
+                let zones = is_zones.then(|| sample.remote.payload.unpack::<Zones>()).flatten();
                 if let Some(zones) = zones.filter(|_| is_zones) {
                     self.sequences.insert(zones.nearest_mm, head.sequence.into());
                     if let Some(owner) = self.owners.get(&head.sensor) {
@@ -238,7 +238,7 @@ fn play(run: &Run) -> Judged {
 /// Of each epoch, sensor and topic what came, what is lost, what was sent before anything was known and what was sent behind
 /// all that is known is everything that was numbered.
 fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
-    let stats = receiving.incoming.stats();
+    let stats = receiving.incoming.gateways();
     let last = sent.datagrams.keys().map(|(epoch, ..)| *epoch).max();
     let (mut received, mut duplicate) = (0, 0);
     for row in stats.rows() {
@@ -258,7 +258,7 @@ fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
         received += row.received;
         duplicate += row.duplicate;
     }
-    assert_eq!((stats.given_up().lives, stats.refused(DatagramError::Stale)), (0, 0));
+    assert_eq!((stats.evicted().runs, stats.refused(DatagramError::Stale)), (0, 0));
     let refused: u64 = DatagramError::ALL.iter().map(|&why| stats.refused(why)).sum();
     assert_eq!((duplicate, refused), (judged.again, judged.refused));
     assert_eq!(received + duplicate + refused + judged.parts, judged.delivered, "each is counted once");

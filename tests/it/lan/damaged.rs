@@ -27,7 +27,7 @@ pub(crate) fn datagrams(count: u32) -> Vec<(Vec<u8>, Value)> {
 
 /// What `schema` says of a datagram, in the words of the list.
 pub(crate) fn expected(bytes: &[u8]) -> Value {
-    let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|()| datagram));
+    let sound = Datagram::read(bytes).and_then(|datagram| datagram.check_payload().map(|_| datagram));
     match sound {
         Ok(datagram) => json!({ "head": says::head(&datagram), "payload": says::payload(&datagram) }),
         Err(refusal) => json!({ "refusal": refusal.name() }),

@@ -5,7 +5,7 @@ use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
     number, read, skip, until,
 };
-use scanhub_network::lan::StreamStats;
+use scanhub_network::lan::GatewayTable;
 use scanhub_schema::datagram::{Datagram, Packed};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::Value;
@@ -38,7 +38,7 @@ fn sent(outcome: &Outcome, to: &str) -> (u64, u64) {
 
 /// What a receiver says: received and lost, in all.
 fn account(heard: &[Vec<u8>]) -> (u64, u64) {
-    let mut account = Box::new(StreamStats::new(&Topic::ALL));
+    let mut account = Box::new(GatewayTable::new(&Topic::ALL));
     heard.iter().for_each(|bytes| assert!(account.receive(bytes, 1, 0).is_ok()));
     let sums = account.rows().map(|row| (row.received, row.lost()));
     sums.fold((0, 0), |sum, row| (sum.0 + row.0, sum.1 + row.1))

@@ -11,7 +11,7 @@ use scanhub_schema::{Failure, Kind, Topic};
 use super::udp_destination::UdpDestination;
 use super::uplink::Uplink;
 use crate::forward::{Carrier, Life};
-use crate::stamp;
+use crate::now;
 
 /// What goes out, and the account of it.
 pub(super) struct Network {
@@ -93,7 +93,7 @@ impl Carrier for Network {
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
-        self.outgoing.sample(sensor, sample, stamp::now(), &mut self.destinations);
+        self.outgoing.sample(sensor, sample, now(), &mut self.destinations);
     }
 }
 

@@ -1,42 +1,42 @@
-//! What a sample is called where networks name what they carry: hub, sensor and topic, as a path. Who sends may write any
-//! name: here it is compared with what the datagram says of itself. Refuses to know who is allowed to send.
+//! Names of samples in networks that deliver by name: hub, sensor and topic as a path. A sender may use any name, so each name is
+//! compared with the datagram.
 
 use std::fmt;
 
 use scanhub_schema::datagram::{Announce, Datagram};
 use scanhub_schema::{Topic, check_sensor};
 
-use crate::lan::incoming::PeerTable;
+use super::GatewayTable;
 
-/// The name of a topic of a remote sensor: `scanhub/HUB/SENSOR/TOPIC`, HUB being 16 hex digits.
+/// Name of a topic of a remote sensor: `scanhub/HUB/SENSOR/TOPIC`. HUB is 16 hex digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Address<'a> {
-    /// The gateway.
+    /// Number of the gateway.
     pub hub: u64,
-    /// The sensor.
+    /// Name of the sensor.
     pub sensor: &'a str,
-    /// The topic; none of announcements.
+    /// Topic; `None` for announcements.
     pub topic: Option<Topic>,
 }
 
-/// What all names begin with.
+/// First word of all names.
 pub const PREFIX: &str = "scanhub";
-/// The last word of the name of announcements.
+/// Last word of the name of announcements.
 pub const ANNOUNCE: &str = "announce";
-/// The last word of the names that are there as long as a hub or a sensor is.
+/// Last word of the names that exist as long as a hub or a sensor does.
 pub const LIVE: &str = "@live";
 
 impl<'a> Address<'a> {
-    /// Returns the address that is written so, if it is one.
+    /// Returns the address with this name. `None` if it is not valid.
     pub fn parse(text: &'a str) -> Option<Address<'a>> {
         let (hub, sensor, last) = words(text)?;
         let topic = if last == ANNOUNCE { None } else { Some(Topic::parse(last)?) };
         Some(Address { hub, sensor, topic })
     }
 
-    /// Returns whether `datagram` may be sent under this name: it says the same of itself, and where only its number says
-    /// which sensor it is of, that one was announced under this name, or not yet.
-    pub fn is_of(&self, datagram: &Datagram<'_>, peers: &PeerTable) -> bool {
+    /// Returns whether `datagram` may be sent under this name: hub and topic are the same, and its sensor was announced under
+    /// this name, or not at all yet.
+    pub fn is_of(&self, datagram: &Datagram<'_>, gateways: &GatewayTable) -> bool {
         let head = &datagram.head;
         let number = self.topic.map_or(Announce::NUMBER, Topic::number);
         if (head.hub, head.topic) != (self.hub, number) {
@@ -44,7 +44,7 @@ impl<'a> Address<'a> {
         }
         match self.topic {
             None => Announce::unpack(datagram.payload).is_none_or(|said| said.sensor() == self.sensor),
-            Some(_) => peers
+            Some(_) => gateways
                 .announced(head.hub, head.epoch, head.sensor)
                 .is_none_or(|known| known.sensor() == self.sensor),
         }
@@ -58,13 +58,13 @@ impl fmt::Display for Address<'_> {
     }
 }
 
-/// Returns the hub and the sensor of a name that is there as long as the sensor is: `scanhub/HUB/SENSOR/@live`.
+/// Returns hub and sensor of a name that exists as long as the sensor does: `scanhub/HUB/SENSOR/@live`.
 pub fn live(text: &str) -> Option<(u64, &str)> {
     let (hub, sensor, last) = words(text)?;
     (last == LIVE).then_some((hub, sensor))
 }
 
-/// Hub, sensor and last word of a name.
+/// Returns hub, sensor and last word of a name.
 fn words(text: &str) -> Option<(u64, &str, &str)> {
     let mut words = text.split('/');
     let (prefix, hub) = (words.next()?, words.next()?);
@@ -84,7 +84,7 @@ mod tests {
     use crate::lan::incoming::Incoming;
 
     #[test]
-    fn names_go_there_and_back() {
+    fn names_round_trip() {
         let scan = Address { hub: 0xab, sensor: "front", topic: Some(Topic::Scan) };
         let text = "scanhub/00000000000000ab/front/scan";
         assert_eq!((scan.to_string().as_str(), Address::parse(text)), (text, Some(scan)));
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_speaks_under_anothers_name() {
+    fn datagrams_are_compared_with_their_name() {
         let sealed = |head: Head, pack: &dyn Fn(&mut [u8]) -> Option<usize>| {
             let mut buffer = [0; 400];
             let len = pack(&mut buffer[HEAD..]).unwrap();
@@ -124,10 +124,10 @@ mod tests {
         let announced = sealed(head, &|room| Announce::new(1, "front", "").pack(room));
         let mut incoming = Incoming::new(&Topic::ALL);
         let may = |incoming: &Incoming, name: &str, bytes: &[u8]| {
-            Address::parse(name).unwrap().is_of(&Datagram::read(bytes).unwrap(), incoming.peers())
+            Address::parse(name).unwrap().is_of(&Datagram::read(bytes).unwrap(), incoming.gateways())
         };
         let (front, rear) = ("scanhub/0000000000000005/front/zones", "scanhub/0000000000000005/rear/zones");
-        assert!(may(&incoming, rear, &zones(5, 2)), "nobody was announced yet");
+        assert!(may(&incoming, rear, &zones(5, 2)), "no sensor was announced yet");
         assert!(!may(&incoming, "scanhub/0000000000000005/rear/announce", &announced));
         assert!(may(&incoming, "scanhub/0000000000000005/front/announce", &announced));
         incoming.receive(&announced, 0, Stamp::default(), &mut Vec::new());

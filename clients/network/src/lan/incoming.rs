@@ -1,133 +1,213 @@
-//! What a listener makes of datagrams: each is refused or counted, and a sample that is new comes out with all that is known
-//! of it. Refuses to know sockets and clocks, and what becomes of samples.
-
-mod duplicate_gateways;
-mod guard;
-mod parts;
-mod peer_table;
-mod remote;
+//! The receiving end of a network: each datagram is refused, recorded in the table of gateways, or becomes a new sample
+//! with everything that is known about its sender.
+//!
+//! With a key, only datagrams that are authenticated with it are accepted, and none that was recorded and is sent again: a
+//! sensor is accepted once an announcement arrives that was sent just now by this machine's clock. From then on, sequence
+//! numbers only increase.
 
 use std::collections::HashMap;
 
-use crate::lan::{Fresh, StreamStats};
-use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head};
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head, LanFlags, Packed};
+use scanhub_schema::{Flags, Header, Quality, Topic};
 
-use crate::lan::{Key, Stamp};
-use duplicate_gateways::DuplicateGateways;
-pub use guard::GATEWAYS;
-use guard::Guard;
-use parts::Parts;
-pub use peer_table::PeerTable;
-pub use remote::Remote;
+use super::address::Address;
+use super::gateways::{Accepted, GatewayTable};
+use super::reassembly::Reassembler;
+use super::sequence::Fresh;
+use super::{Key, Stamp};
 
-/// The incoming end: everything that was heard of any gateway.
+/// Receiving end of a network.
 pub struct Incoming {
-    stats: Box<StreamStats>,
-    peers: PeerTable,
-    duplicates: DuplicateGateways,
-    parts: Parts,
-    /// Nothing is believed without it, if there is one.
-    guard: Option<Guard>,
+    gateways: GatewayTable,
+    parts: Reassembler,
+    key: Option<Key>,
+    /// Gateways whose datagrams are received; empty: all.
+    hubs: Vec<u64>,
 }
 
-/// What a datagram is to who received it.
+/// Maximum difference of the clocks for the first announcement of a sensor, if there is a key.
+const FIRST_WITHIN_NS: u64 = 5_000_000_000;
+
+/// Result of receiving a datagram.
 pub enum Arrived<'a> {
-    /// It was refused.
+    /// The datagram was refused and counted.
     Refused {
-        /// The reason, under which it is counted.
+        /// Reason under which it is counted.
         why: DatagramError,
-        /// The gateway's number, if two are known to send under it.
+        /// Number of the gateway, if two are known to send under it.
         shared: Option<u64>,
     },
-    /// It is the first announcement of a sensor, and has the key, but is stamped by a clock that is so much behind ours, in
-    /// ns, or was recorded so long ago; it was refused.
+    /// The datagram was refused: it is the first announcement of a sensor and is authenticated, but its stamp is off.
+    /// The clocks differ, or it was recorded.
     Untimely {
-        /// How much.
+        /// By how much the stamp is behind this machine's clock, in ns.
         behind_ns: i64,
     },
-    /// It is a part of a sample that is not whole yet.
+    /// The datagram comes from a gateway that is not received. It is not counted.
+    Ignored,
+    /// The datagram is not one that may be sent under the name that it arrived under. It is not counted.
+    Foreign,
+    /// A part of a sample that is not complete yet.
     Part,
-    /// It came before, or announces what a newer one has announced.
+    /// A duplicate, or an announcement that is older than the last one.
     Known,
-    /// It says who a sensor is.
+    /// An announcement of a sensor.
     Announced(Announcement),
-    /// It is a sample that did not come before.
+    /// A new sample.
     Sample(RemoteSample<'a>),
 }
 
-/// The newest announcement of a sensor.
+/// Newest announcement of a sensor.
 pub struct Announcement {
-    /// What it came with.
+    /// Header of its datagram.
     pub head: Head,
-    /// What it says.
+    /// Content.
     pub announce: Announce,
-    /// CLOCK_MONOTONIC of this machine when it came, in ns.
+    /// CLOCK_MONOTONIC of this machine at its arrival, in ns.
     pub arrival_ns: u64,
-    /// A life of its gateway begins with it.
+    /// Whether a run of its gateway begins with it.
     pub begins: bool,
-    /// [`Incoming::written`] called the sensor by its number before, and now it has this name.
+    /// Whether the sensor was printed under its number before, and has this name now.
     pub is_named: bool,
-    /// How much the gateway's clock is behind this one's, in ns, if they differ; said once of each gateway.
+    /// By how much the gateway's clock is behind this machine's, in ns, if they differ. Reported once for each gateway.
     pub behind_ns: Option<i64>,
-    /// Whether its gateway had the key, or samples that it has sent cover a second or more.
+    /// Whether its gateway has the key, or has delivered samples for a second or more.
     pub is_proven: bool,
 }
 
-/// A sample, and what is known of who sent it.
+/// A sample, and what is known about its sender.
 pub struct RemoteSample<'a> {
     /// The sample.
     pub remote: Remote<'a>,
-    /// What was announced last of its sensor.
+    /// Last announcement of its sensor.
     pub announced: Option<Announce>,
-    /// A life of its gateway begins with it.
+    /// Whether a run of its gateway begins with it.
     pub begins: bool,
-    /// Samples of its topic that were sent before it and did not come, or not yet; 0 if it is late.
+    /// Samples of its topic that were sent before it and have not arrived; 0 if it is late.
     pub missed: u32,
-    /// Whether its gateway had the key, or samples that it has sent cover a second or more.
+    /// Whether its gateway has the key, or has delivered samples for a second or more.
     pub is_proven: bool,
 }
 
+/// Payload of a sample as in a datagram. It is valid for its topic.
+#[derive(Clone, Copy, Debug)]
+pub struct CheckedPayload<'a> {
+    /// The payload as it was received.
+    pub bytes: &'a [u8],
+    /// Bytes of memory that it fills, as [`Packed::room`] returned when it was checked.
+    pub room: usize,
+}
+
+/// A sample of another machine.
+#[derive(Clone, Copy)]
+pub struct Remote<'a> {
+    /// Its topic.
+    pub topic: Topic,
+    /// Header of its datagram.
+    pub head: Head,
+    /// Its payload.
+    pub payload: CheckedPayload<'a>,
+    /// Run of its hub; 0 if unknown.
+    pub boot: u64,
+    /// CLOCK_MONOTONIC of this machine at its arrival, in ns.
+    pub arrival_ns: u64,
+    /// Age at its arrival, in ns, if the clocks agree.
+    pub age_ns: Option<u64>,
+    /// Whether it arrived after a newer one.
+    pub late: bool,
+    /// Whether it has a MAC of the receiver's key.
+    pub authenticated: bool,
+}
+
+impl Remote<'_> {
+    /// Returns the header of the sample when process `pid` publishes it here. Its stamps are those of the arrival, and the
+    /// sensor's is in `wall_ns`. It has no period, because a gateway may leave out samples.
+    pub fn header(&self, pid: u32) -> Header {
+        let head = &self.head;
+        let quality = if head.flags & LanFlags::SUSPECT != 0 { Quality::Suspect } else { Quality::Clean };
+        let same = LanFlags::SIMULATED | LanFlags::REPLAYED | LanFlags::STAMP_ESTIMATED;
+        Header {
+            seq: head.counter.into(),
+            topic_seq: head.sequence.into(),
+            stamp_first_ns: self.arrival_ns,
+            stamp_last_ns: self.arrival_ns,
+            wall_ns: head.stamp_ns,
+            boot: self.boot,
+            sensor: head.sensor,
+            quality: quality as u8,
+            flags: head.flags & same | Flags::REMOTE,
+            family: head.family,
+            hub_pid: pid,
+            ..Header::default()
+        }
+    }
+}
+
+impl CheckedPayload<'_> {
+    /// Returns the payload as a value, whose type is that of the topic. `None` if there is too little memory.
+    pub fn unpack<P: Packed + ?Sized>(&self) -> Option<Box<P>>
+    where
+        Box<P>: Default,
+    {
+        let mut payload = Box::default();
+        P::make_room(&mut payload, self.room);
+        payload.fill(self.bytes, self.room).then_some(payload)
+    }
+}
+
 impl Arrived<'_> {
-    /// Returns the header of a datagram with which a life of its gateway begins.
+    /// Returns the header of a datagram with which a run of its gateway begins.
     pub fn begins(&self) -> Option<&Head> {
         match self {
             Arrived::Announced(announced) if announced.begins => Some(&announced.head),
-            Arrived::Sample(sample) if sample.begins => Some(&sample.remote.datagram.head),
+            Arrived::Sample(sample) if sample.begins => Some(&sample.remote.head),
             _ => None,
         }
     }
 }
 
 impl Incoming {
-    /// Makes an end that heard nothing yet. Announcements are believed for `topics` only, as [`StreamStats::new`] says.
+    /// Creates a receiving end without a key. Announcements are accepted for `topics`, as [`GatewayTable::new`] explains.
     pub fn new(topics: &[Topic]) -> Incoming {
-        Incoming {
-            stats: Box::new(StreamStats::new(topics)),
-            peers: PeerTable::default(),
-            duplicates: DuplicateGateways::default(),
-            parts: Parts::default(),
-            guard: None,
-        }
+        let (gateways, parts) = (GatewayTable::new(topics), Reassembler::default());
+        Incoming { gateways, parts, key: None, hubs: Vec::new() }
     }
 
-    /// Makes an end that believes only what was sent with `key`, and is not older than it can be: `epochs` has the greatest
-    /// epoch of each gateway that was heard before, see [`take_epochs`](Incoming::take_epochs); it knows [`GATEWAYS`] at most.
+    /// Creates a receiving end that accepts only what is authenticated with `key`. `epochs` has the highest epoch of each
+    /// gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
     pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
-        Incoming {
-            stats: Box::new(StreamStats::new(topics).only_announced()),
-            guard: Some(Guard::new(key, epochs)),
-            ..Incoming::new(topics)
-        }
+        let end = Incoming::new(topics);
+        Incoming { gateways: end.gateways.keyed(epochs), key: Some(key), ..end }
     }
 
-    /// Returns the greatest epochs of all gateways that had the key, to be kept, if one of them is new since the last call.
-    pub fn take_epochs(&mut self) -> Option<&HashMap<u64, u32>> {
-        self.guard.as_mut()?.take_changed()
+    /// Receives only from these gateways; if there are none, from all.
+    pub fn only(self, hubs: Vec<u64>) -> Incoming {
+        Incoming { hubs, ..self }
     }
 
-    /// Takes `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
-    /// have, for example its address and port. Where a sample came in parts, it is in `whole` once the last of them is there.
+    /// Returns the highest authenticated epochs of all gateways, which must outlive this process, if one is new since the last
+    /// call.
+    pub fn take_epochs(&mut self) -> Option<HashMap<u64, u32>> {
+        self.gateways.take_epochs()
+    }
+
+    /// Returns the gateways, and everything that was counted.
+    pub fn gateways(&self) -> &GatewayTable {
+        &self.gateways
+    }
+
+    /// Counts a sample of `hub` that did not fit into the memory that remote sensors may use.
+    pub fn count_no_room(&mut self, hub: u64) {
+        self.gateways.count_no_room(hub);
+    }
+
+    /// Returns the name of the sensor that sent `head`, which is printed now: its name, or `#` and its number.
+    pub fn printed_name(&mut self, head: &Head) -> String {
+        self.gateways.printed_name(head)
+    }
+
+    /// Handles `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
+    /// have, for example its address and port. A sample that came in parts is written to `whole` once it is complete.
     pub fn receive<'a>(
         &mut self,
         bytes: &'a [u8],
@@ -135,127 +215,299 @@ impl Incoming {
         arrival: Stamp,
         whole: &'a mut Vec<u8>,
     ) -> Arrived<'a> {
-        let mut datagram = match self.stats.read(bytes) {
-            Ok(datagram) => datagram,
-            Err(why) => return Arrived::Refused { why, shared: None },
-        };
-        if let Some(guard) = &self.guard
-            && let Err(why) = guard.check(bytes, &datagram, &self.stats, arrival.wall_ns)
-        {
-            self.stats.refuse(why);
-            if why == DatagramError::Untimely && datagram.head.topic == Announce::NUMBER {
-                return Arrived::Untimely {
-                    behind_ns: arrival.wall_ns.wrapping_sub(datagram.head.stamp_ns) as i64,
+        self.receive_named(bytes, None, from, arrival, whole)
+    }
+
+    /// Does the same as [`receive`](Incoming::receive) for a network that delivers datagrams under a `name`.
+    pub fn receive_named<'a>(
+        &mut self,
+        bytes: &'a [u8],
+        name: Option<&Address<'_>>,
+        from: u64,
+        arrival: Stamp,
+        whole: &'a mut Vec<u8>,
+    ) -> Arrived<'a> {
+        // The only place where a checksum is computed.
+        let read = Datagram::read(bytes);
+        if let Ok(datagram) = &read {
+            if name.is_some_and(|name| !name.is_of(datagram, &self.gateways)) {
+                return Arrived::Foreign;
+            }
+            if !self.hubs.is_empty() && !self.hubs.contains(&datagram.head.hub) {
+                return Arrived::Ignored;
+            }
+        }
+        let taken = read
+            .and_then(|datagram| self.check_key(bytes, &datagram, arrival).map(|()| datagram))
+            .and_then(|datagram| self.complete(datagram, from, whole));
+        let datagram = match taken {
+            Ok(Some(datagram)) => datagram,
+            Ok(None) => return Arrived::Part,
+            Err(why) => {
+                self.gateways.refuse(why);
+                return match read {
+                    Ok(Datagram { head, .. })
+                        if why == DatagramError::Untimely && head.topic == Announce::NUMBER =>
+                    {
+                        Arrived::Untimely { behind_ns: arrival.wall_ns.wrapping_sub(head.stamp_ns) as i64 }
+                    }
+                    _ => Arrived::Refused { why, shared: None },
                 };
             }
-            return Arrived::Refused { why, shared: None };
-        }
-        if datagram.head.parts > 1 {
-            let is_known = match self.stats.check_part(&datagram.head) {
-                Ok(is_known) => is_known,
-                Err(why) => return Arrived::Refused { why, shared: None },
-            };
-            let Some(head) = self.parts.take(&datagram, from, is_known, whole) else { return Arrived::Part };
-            datagram = Datagram { head, payload: whole, mac: None };
-        }
-        if let Some(guard) = &self.guard
-            && guard.is_timely(&datagram.head, arrival.wall_ns)
-        {
-            self.stats.follow(&datagram, from, arrival.monotonic_ns);
-        }
-        match self.stats.take(&datagram, from, arrival.monotonic_ns) {
-            Ok(Fresh::Duplicate) => Arrived::Known,
-            Ok(fresh) => {
-                if let Some(guard) = &mut self.guard {
-                    guard.note(datagram.head.hub, datagram.head.epoch);
-                }
-                self.duplicates.taken(datagram.head.hub);
-                self.accepted(datagram, fresh == Fresh::Late, arrival)
-            }
-            Err(why) => Arrived::Refused { why, shared: self.shared(why, &datagram.head, arrival) },
-        }
-    }
-
-    /// Returns the account of all that came and did not.
-    pub fn stats(&self) -> &StreamStats {
-        &self.stats
-    }
-
-    /// Returns what sensors are called.
-    pub fn peers(&self) -> &PeerTable {
-        &self.peers
-    }
-
-    /// Returns what the sensor that sent `head` is called, to be written now: its name, or `#` and its number.
-    pub fn written(&mut self, head: &Head) -> String {
-        self.peers.written(head, &self.stats)
-    }
-
-    /// A datagram that was not there before.
-    fn accepted<'a>(&mut self, datagram: Datagram<'a>, late: bool, arrival: Stamp) -> Arrived<'a> {
-        let head = datagram.head;
-        let begins = self.peers.is_new(&head, &self.stats);
-        let Some(topic) = Topic::of_number(head.topic) else {
-            // What it says was said again, and better, by a newer one.
-            return if late { Arrived::Known } else { self.announced(&datagram, begins, arrival) };
         };
-        let life = self.peers.life(&head, &self.stats);
-        let age_ns = life.age_ns(head.stamp_ns, arrival.wall_ns);
-        let sensor = life.sensor(head.sensor);
-        let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
-        let announced = sensor.announced;
-        // What follows it is a later revision's.
-        let telegram = datagram.telegram().filter(|_| topic == Topic::Telegram);
-        let datagram =
-            Datagram { payload: telegram.map_or(datagram.payload, |telegram| telegram.bytes), ..datagram };
-        let boot = announced.map_or(0, |announced| announced.boot);
-        let (arrival_ns, authenticated) = (arrival.monotonic_ns, self.guard.is_some());
-        let is_proven = self.is_proven(&head);
-        let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late, authenticated };
+        let head = &datagram.head;
+        let may_move = self.key.is_some() && is_timely(head, arrival);
+        match self.gateways.take(&datagram, from, may_move, arrival.monotonic_ns) {
+            Ok(Accepted { fresh: Fresh::Duplicate, .. }) => Arrived::Known,
+            Ok(accepted) => self.accepted(&datagram, &accepted, arrival),
+            Err(why) => {
+                self.gateways.refuse(why);
+                let may_be_shared = matches!(why, DatagramError::Epoch | DatagramError::Twin);
+                let is_shared = may_be_shared && self.gateways.is_duplicate(head, arrival.monotonic_ns);
+                Arrived::Refused { why, shared: is_shared.then_some(head.hub) }
+            }
+        }
+    }
+
+    /// Checks that `datagram`, which was read from `bytes`, is authenticated and cannot be a recorded one, if there is a key.
+    fn check_key(&self, bytes: &[u8], datagram: &Datagram<'_>, arrival: Stamp) -> Result<(), DatagramError> {
+        let (Some(key), head) = (&self.key, &datagram.head) else { return Ok(()) };
+        if !key.is_of(bytes, datagram.mac.ok_or(DatagramError::Unauthenticated)?) {
+            return Err(DatagramError::Mac);
+        }
+        if self.gateways.kept_epoch(head.hub).is_some_and(|kept| head.epoch < kept) {
+            return Err(DatagramError::Epoch);
+        }
+        if !self.gateways.is_announced(head) && !is_timely(head, arrival) {
+            return Err(DatagramError::Untimely);
+        }
+        Ok(())
+    }
+
+    /// Returns the complete sample of `datagram`: itself, or the sample that it is the last part of, which is written to `whole`.
+    fn complete<'a>(
+        &mut self,
+        datagram: Datagram<'a>,
+        from: u64,
+        whole: &'a mut Vec<u8>,
+    ) -> Result<Option<Datagram<'a>>, DatagramError> {
+        if datagram.head.parts == 1 {
+            return Ok(Some(datagram));
+        }
+        let is_known = self.gateways.check_part(&datagram.head)?;
+        let complete = self.parts.take(&datagram, from, is_known, whole);
+        Ok(complete.map(|head| Datagram { head, payload: whole, mac: None }))
+    }
+
+    /// Handles a datagram that was not received before.
+    fn accepted<'a>(&mut self, datagram: &Datagram<'a>, accepted: &Accepted, arrival: Stamp) -> Arrived<'a> {
+        let (head, late) = (datagram.head, accepted.fresh == Fresh::Late);
+        let (begins, arrival_ns) = (accepted.begins, arrival.monotonic_ns);
+        let is_proven = self.key.is_some() || self.gateways.is_proven(head.hub, head.epoch);
+        let Some(topic) = Topic::of_number(head.topic) else {
+            // A newer announcement supersedes a late one.
+            let Some(announce) = accepted.announce.filter(|_| !late) else { return Arrived::Known };
+            let (behind_ns, is_named) = self.gateways.announce(&head, &announce, arrival.wall_ns);
+            return Arrived::Announced(Announcement {
+                head,
+                announce,
+                arrival_ns,
+                begins,
+                is_named,
+                behind_ns,
+                is_proven,
+            });
+        };
+        let announced = self.gateways.announced(head.hub, head.epoch, head.sensor).copied();
+        // Bytes after a telegram belong to a later revision.
+        let (room, is_telegram) = (accepted.room, topic == Topic::Telegram);
+        let bytes = if is_telegram { &datagram.payload[..room] } else { datagram.payload };
+        let remote = Remote {
+            topic,
+            head,
+            payload: CheckedPayload { bytes, room },
+            boot: announced.map_or(0, |announced| announced.boot),
+            arrival_ns,
+            age_ns: self.gateways.age_ns(&head, arrival.wall_ns),
+            late,
+            authenticated: self.key.is_some(),
+        };
+        let missed = if late { 0 } else { accepted.missed };
         Arrived::Sample(RemoteSample { remote, announced, begins, missed, is_proven })
     }
+}
 
-    fn is_proven(&self, head: &Head) -> bool {
-        self.guard.is_some() || self.stats.is_proven(head.hub, head.epoch)
-    }
-
-    fn announced<'a>(&mut self, datagram: &Datagram<'a>, begins: bool, arrival: Stamp) -> Arrived<'a> {
-        let head = datagram.head;
-        let Some(announce) = Announce::unpack(datagram.payload) else { return Arrived::Known };
-        let behind_ns = self.peers.announce(&head, &self.stats, &announce, arrival.wall_ns);
-        let is_named = self.peers.life(&head, &self.stats).sensor(head.sensor).take_numbered();
-        Arrived::Announced(Announcement {
-            head,
-            announce,
-            arrival_ns: arrival.monotonic_ns,
-            begins,
-            is_named,
-            behind_ns,
-            is_proven: self.is_proven(&head),
-        })
-    }
-
-    /// Whose number it is, if a sample with this `head`, that was refused, shows that two gateways have it.
-    fn shared(&mut self, why: DatagramError, head: &Head, arrival: Stamp) -> Option<u64> {
-        if !matches!(why, DatagramError::Epoch | DatagramError::Twin) {
-            return None;
-        }
-        let Head { hub, epoch, .. } = *head;
-        let is_shared =
-            self.stats.is_shared(hub, epoch) || self.duplicates.refused(hub, arrival.monotonic_ns);
-        is_shared.then_some(hub)
-    }
+/// Returns whether `head` belongs to an announcement that was sent just now, by this machine's clock.
+fn is_timely(head: &Head, arrival: Stamp) -> bool {
+    head.topic == Announce::NUMBER && arrival.wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS
 }
 
 #[cfg(test)]
 mod tests {
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{Announced, HEAD, PORT, group};
+
     use super::*;
 
-    use scanhub_schema::Zones;
-    use scanhub_schema::datagram::{HEAD, Packed};
+    const SECOND: u64 = 1_000_000_000;
 
-    /// A datagram with zones, of gateway 5.
+    fn key() -> Key {
+        Key::new(&[7; 32])
+    }
+
+    fn sealed(head: Head, pack: impl FnOnce(&mut [u8]) -> Option<usize>) -> Vec<u8> {
+        let mut buffer = [0; 400];
+        let len = pack(&mut buffer[HEAD..]).unwrap();
+        let head = Head { revision: 1, hub: 5, ..head };
+        head.seal_with(&mut buffer, len, |covered| key().mac(covered)).unwrap().to_vec()
+    }
+
+    /// Announces sensor 0 at `at_s` of the gateway's clock, which has `next` zones.
+    fn announcement(epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
+        announced_of(1, epoch, sequence, at_s, next)
+    }
+
+    /// The same in this life of its hub.
+    fn announced_of(boot: u64, epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
+        let mut announce = Announce::new(boot, "front", "");
+        let topic = Topic::Zones;
+        announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
+        sealed(Head { epoch, sequence, stamp_ns: at_s * SECOND, ..Head::default() }, |room| {
+            announce.pack(room)
+        })
+    }
+
     fn zones(epoch: u32, sequence: u32) -> Vec<u8> {
+        sealed(Head { topic: Topic::Zones.number(), epoch, sequence, ..Head::default() }, |room| {
+            Zones::unknown().pack(room)
+        })
+    }
+
+    fn listener(epochs: &[(u64, u32)]) -> Incoming {
+        Incoming::with_key(&Topic::ALL, key(), epochs.iter().copied().collect())
+    }
+
+    /// What becomes of `bytes` from sender 1 at `at_s` of the listener's clock: why it is refused, if it is.
+    fn receive(incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
+        receive_from(1, incoming, bytes, at_s)
+    }
+
+    fn receive_from(from: u64, incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
+        let arrival = Stamp { monotonic_ns: at_s * SECOND, wall_ns: at_s * SECOND };
+        match incoming.receive(bytes, from, arrival, &mut Vec::new()) {
+            Arrived::Refused { why, .. } => Some(why),
+            Arrived::Untimely { .. } => Some(DatagramError::Untimely),
+            _ => None,
+        }
+    }
+
+    #[test]
+    fn only_who_has_the_key_is_believed() {
+        let mut incoming = listener(&[]);
+        let mut plain = [0; 400];
+        let len = Zones::unknown().pack(&mut plain[HEAD..]).unwrap();
+        let head = Head { topic: Topic::Zones.number(), revision: 1, hub: 5, ..Head::default() };
+        let bytes = head.seal(&mut plain, len).unwrap().to_vec();
+        assert_eq!(receive(&mut incoming, &bytes, 100), Some(DatagramError::Unauthenticated));
+        let other = head.seal_with(&mut plain, len, |covered| Key::new(&[8; 32]).mac(covered)).unwrap();
+        assert_eq!(receive(&mut incoming, other, 100), Some(DatagramError::Mac));
+        assert_eq!(receive(&mut incoming, &announcement(1, 0, 100, 0), 100), None);
+        assert_eq!(receive(&mut incoming, &zones(1, 0), 100), None);
+        let refused = |why| incoming.gateways().refused(why);
+        assert_eq!([DatagramError::Unauthenticated, DatagramError::Mac].map(refused), [1, 1]);
+    }
+
+    #[test]
+    fn a_recording_that_is_sent_again_is_refused() {
+        let recorded = [announcement(1, 3, 100, 40), zones(1, 40), zones(1, 41)];
+        let mut incoming = listener(&[]);
+        let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 200));
+        assert_eq!(again, [Some(DatagramError::Untimely); 3], "the gateway is gone");
+        // The gateway goes on: its announcement is believed, and nothing that was sent before.
+        assert_eq!(receive(&mut incoming, &zones(1, 90), 200), Some(DatagramError::Untimely));
+        assert_eq!(receive(&mut incoming, &announcement(1, 50, 200, 91), 203), None);
+        assert_eq!(receive(&mut incoming, &zones(1, 91), 203), None);
+        let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 204));
+        assert_eq!(again, [Some(DatagramError::Stale); 3]);
+        let clocks = [announcement(2, 0, 94, 0), announcement(2, 0, 106, 0)];
+        let refused = clocks.map(|bytes| receive(&mut listener(&[]), &bytes, 100));
+        assert_eq!(refused, [Some(DatagramError::Untimely); 2]);
+    }
+
+    #[test]
+    fn epochs_only_go_forward_over_restarts_of_the_listener() {
+        let mut incoming = listener(&[]);
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
+        let kept: Vec<_> =
+            incoming.take_epochs().unwrap().iter().map(|(hub, epoch)| (*hub, *epoch)).collect();
+        assert_eq!((kept.as_slice(), incoming.take_epochs()), (&[(5, 7)][..], None));
+        let mut next = listener(&kept);
+        assert_eq!(receive(&mut next, &announcement(6, 0, 100, 0), 100), Some(DatagramError::Epoch));
+        assert_eq!(receive(&mut next, &announcement(7, 1, 101, 0), 101), None);
+        assert_eq!(
+            (receive(&mut next, &announcement(8, 0, 102, 0), 102), next.take_epochs().is_some()),
+            (None, true)
+        );
+        assert_eq!(receive(&mut next, &zones(7, 0), 102), Some(DatagramError::Epoch));
+    }
+
+    #[test]
+    fn another_sender_is_not_the_next_life_of_a_silent_gateway() {
+        let mut incoming = listener(&[]);
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
+        assert_eq!(receive_from(2, &mut incoming, &zones(7, 0), 110), Some(DatagramError::Twin));
+    }
+
+    #[test]
+    fn a_gateway_may_change_its_address_while_its_hub_starts_again() {
+        let mut incoming = listener(&[]);
+        let twin = Some(DatagramError::Twin);
+        assert_eq!(receive(&mut incoming, &announcement(7, 4, 100, 0), 100), None);
+        assert_eq!(receive(&mut incoming, &zones(7, 0), 100), None);
+        let mut moved = |bytes: &[u8], at_s| receive_from(2, &mut incoming, bytes, at_s);
+        assert_eq!(moved(&announced_of(2, 7, 5, 102, 1), 102), twin, "the other one was heard just now");
+        assert_eq!(moved(&announced_of(2, 7, 6, 104, 1), 110), twin, "recorded");
+        assert_eq!(moved(&announced_of(2, 7, 4, 110, 1), 110), twin, "of a number that came");
+        assert_eq!(moved(&zones(7, 1), 110), twin, "nothing was announced there yet");
+        assert_eq!(moved(&announced_of(2, 7, 8, 110, 1), 110), None);
+        assert_eq!(moved(&zones(7, 0), 110), None, "which is a duplicate");
+        assert_eq!(moved(&zones(7, 1), 110), None);
+        assert_eq!(incoming.gateways().rows().map(|row| row.received).sum::<u64>(), 4);
+        assert_eq!(receive(&mut incoming, &announcement(7, 9, 110, 1), 110), None, "and back, the same boot");
+        assert_eq!(receive(&mut incoming, &zones(7, 2), 110), None);
+    }
+
+    #[test]
+    fn parts_of_a_recording_are_refused_before_memory_is_spent_on_them() {
+        let mut incoming = listener(&[]);
+        let part = |sequence, part| {
+            let topic = Topic::Zones.number();
+            let head = Head { topic, epoch: 7, sequence, part, parts: 2, ..Head::default() };
+            sealed(head, |room| {
+                let len = Zones::unknown().pack(room)? / 2;
+                room.copy_within(len * usize::from(part)..len * (usize::from(part) + 1), 0);
+                Some(len)
+            })
+        };
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 40), 100), None);
+        assert_eq!(receive(&mut incoming, &part(39, 0), 100), Some(DatagramError::Stale));
+        assert_eq!([0, 1].map(|at| receive(&mut incoming, &part(40, at), 100)), [None; 2]);
+        // A sample that is new goes on waiting, however many of those that came are sent again meanwhile.
+        assert_eq!(receive(&mut incoming, &part(60, 0), 101), None);
+        for sequence in (41..50).chain(52..60) {
+            [0, 1].iter().for_each(|&at| assert_eq!(receive(&mut incoming, &part(sequence, at), 101), None));
+        }
+        for sequence in 41..50 {
+            assert_eq!(receive(&mut incoming, &part(sequence, 0), 101), None);
+        }
+        assert_eq!(receive(&mut incoming, &part(60, 1), 101), None);
+        let received: u64 =
+            incoming.gateways().rows().filter(|row| row.topic != 0).map(|row| row.received).sum();
+        assert_eq!((received, incoming.gateways().refused(DatagramError::Stale)), (19, 1));
+    }
+
+    /// A datagram with zones of gateway 5, without a MAC.
+    fn plain_zones(epoch: u32, sequence: u32) -> Vec<u8> {
         let mut buffer = [0; 100];
         let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
         let topic = Topic::Zones.number();
@@ -268,7 +520,7 @@ mod tests {
         let mut incoming = Incoming::new(&Topic::ALL);
         let mut begins = |epoch, sequence, from, ms: u64| {
             let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
-            let bytes = zones(epoch, sequence);
+            let bytes = plain_zones(epoch, sequence);
             let mut whole = Vec::new();
             let arrived = incoming.receive(&bytes, from, arrival, &mut whole);
             arrived.begins().map(|head| head.epoch)
@@ -276,5 +528,17 @@ mod tests {
         assert_eq!([begins(7, 0, 1, 10), begins(7, 1, 1, 10), begins(7, 2, 1, 11)], [Some(7), None, None]);
         assert_eq!([begins(8, 0, 1, 11), begins(8, 1, 1, 11), begins(7, 3, 1, 11)], [Some(8), None, None]);
         assert_eq!([begins(8, 0, 2, 3000), begins(8, 0, 2, 3011)], [None, Some(8)], "another one's");
+    }
+
+    #[test]
+    fn receives_only_from_hubs_that_are_named() {
+        let mut incoming = Incoming::new(&Topic::ALL).only(vec![4, 5]);
+        let mut is_ignored = |bytes: &[u8]| {
+            matches!(incoming.receive(bytes, 1, Stamp::default(), &mut Vec::new()), Arrived::Ignored)
+        };
+        let other = Head { hub: 6, ..Head::default() }.seal(&mut [0; HEAD], 0).unwrap().to_vec();
+        assert!(is_ignored(&other) && !is_ignored(&plain_zones(1, 0)));
+        assert!(!is_ignored(b"a broken datagram is counted"));
+        assert_eq!(DatagramError::ALL.map(|why| incoming.gateways().refused(why)).iter().sum::<u64>(), 1);
     }
 }

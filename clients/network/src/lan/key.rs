@@ -1,5 +1,4 @@
-//! The key that gateways and listeners of one network share: who has it can send what they believe. Refuses to know where
-//! it is kept, and whether what was sent is new.
+//! The key that gateways and listeners of one network share. Listeners accept whatever is authenticated with it.
 
 use hmac::{Hmac, KeyInit, Mac};
 use scanhub_schema::datagram::{MAC, covered};
@@ -13,7 +12,7 @@ impl Key {
     /// Bytes of a key.
     pub const LEN: usize = 32;
 
-    /// The key with these bytes.
+    /// Creates a key of these bytes.
     pub fn new(bytes: &[u8; Key::LEN]) -> Key {
         let mut block = [0; 64];
         block[..Key::LEN].copy_from_slice(bytes);
@@ -27,14 +26,14 @@ impl Key {
         std::array::from_fn(|at| whole[at])
     }
 
-    /// Returns whether `bytes`, a datagram that was read, has `mac` of this key.
+    /// Returns whether `mac` of `bytes`, a datagram that was read, was computed with this key.
     pub fn is_of(&self, bytes: &[u8], mac: &[u8; MAC]) -> bool {
         let digest =
             covered(bytes).into_iter().fold(self.0.clone(), |digest, piece| digest.chain_update(piece));
         digest.verify_truncated_left(mac).is_ok()
     }
 
-    /// Returns a name for the key that does not tell it: 16 hex digits.
+    /// Returns a name for the key that does not reveal it: 16 hex digits.
     pub fn name(&self) -> String {
         self.mac(b"name").iter().take(8).map(|byte| format!("{byte:02x}")).collect()
     }
@@ -53,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_sealed_with_a_key_is_of_that_key_alone() {
+    fn mac_belongs_to_one_key() {
         let (key, other) = (Key::new(&[7; 32]), Key::new(&[8; 32]));
         let mut buffer = [0; 200];
         buffer[HEAD..HEAD + 3].copy_from_slice(b"abc");
@@ -68,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_does_not_tell_itself() {
+    fn debug_output_does_not_reveal_the_key() {
         let shown = format!("{:?}", Key::new(&[0x61; 32]));
         assert!(!shown.contains("6161") && !shown.contains("aaa") && shown.len() == 21, "{shown}");
     }

@@ -1,35 +1,29 @@
-//! Sensors of other machines in the domain of this one, so that a consumer follows them as it follows those of a hub.
-//! Refuses to know the network: what it gets was checked and is new. Nor does it know where topics are made.
+//! Publishes the sensors of other machines in the domain of this one, so that programs can subscribe to them like to those
+//! of a hub. Samples come from [`Incoming`](super::incoming::Incoming), and where topics are created is up to a
+//! [`TopicStore`].
 
-mod arrivals;
-mod candidates;
-mod sensor;
-mod store;
-mod stream;
+mod remote_sensor;
 
-use crate::lan::{Arrival, LIVES};
+use std::collections::VecDeque;
+
 use scanhub_schema::datagram::{Announce, Head};
-use scanhub_schema::{Failure, Topic};
+use scanhub_schema::{Failure, Header, Topic, Wake};
 
-use crate::lan::Stamp;
-use crate::lan::incoming::{Announcement, RemoteSample};
-use candidates::{Candidate, Candidates};
-use sensor::{Outcome, RemoteSensor};
-pub use store::{SensorTopics, TopicStore};
-pub use stream::{Placed, Stream};
+use super::incoming::{Announcement, CheckedPayload, Remote, RemoteSample};
+use super::{Arrival, Stamp};
+use remote_sensor::{Outcome, RemoteSensor};
 
-/// The publishing end of all remote sensors of a domain.
+/// Publisher of all remote sensors in a domain.
 pub struct Republisher<S: TopicStore> {
     sensors: Vec<RemoteSensor<S::Sensor>>,
-    /// What was not published.
+    /// Samples that were not published.
     pub left_out: LeftOut,
-    /// Sensors that were put out for others.
+    /// Sensors that were evicted for others.
     pub displaced: u64,
-    no_room: NoRoom,
-    /// Whether topics are made only for sensors of a gateway that is known to deliver.
+    /// Whether topics are created only for sensors of a gateway that is known to deliver.
     only_proven: bool,
     candidates: Candidates,
-    /// So many may still be put out, and when there will be one more.
+    /// Number of sensors that may still be evicted, and the time at which it increases by 1.
     allowance: usize,
     allow_ns: u64,
     greet_ns: u64,
@@ -38,65 +32,48 @@ pub struct Republisher<S: TopicStore> {
     store: S,
 }
 
-/// Samples that came and were not published, by the reason.
+/// Samples that were received and not published, by reason.
 #[derive(Clone, Copy, Default)]
 pub struct LeftOut {
-    /// Nobody announced their sensor yet, so that it has no name.
+    /// Their sensor has no name, because it is not announced yet.
     pub unnamed: u64,
-    /// Of topics that their sensor's announcement does not name.
+    /// Their sensor's announcement does not name their topic.
     pub unannounced: u64,
-    /// A newer one was published already.
+    /// A newer sample was published before.
     pub late: u64,
-    /// Of sensors beyond the [`SENSORS`] for which there was room.
+    /// Their sensor is beyond the [`MAX_SENSORS`] for which there is room.
     pub capacity: u64,
-    /// Announced, but there was no memory or no descriptor for their topic.
+    /// There was no memory or no descriptor for their topic.
     pub shortage: u64,
-    /// Samples of sensors whose gateway is not known to deliver yet.
+    /// Their gateway is not known to deliver yet.
     pub unproven: u64,
-    /// Samples whose sensor or topic did not fit into the memory that remote sensors may use.
+    /// Their sensor or topic did not fit into the memory that remote sensors may use.
     pub no_room: u64,
 }
 
-/// Samples that did not fit into the memory that remote sensors may use, by gateway.
-#[derive(Default)]
-struct NoRoom(Vec<(u64, u64)>);
-
-impl NoRoom {
-    /// Counts a sample of `hub`. Gateways after the first [`LIVES`] are counted only in [`LeftOut::no_room`], because
-    /// anyone who can send can invent more.
-    fn count(&mut self, hub: u64) {
-        if let Some(at) = self.0.iter().position(|(known, _)| *known == hub) {
-            self.0[at].1 += 1;
-        } else if self.0.len() < LIVES {
-            self.0.push((hub, 1));
-        }
-    }
-}
-
 /// Maximum number of sensors. Anyone who can send to the network can announce some.
-pub const SENSORS: usize = 16;
+pub const MAX_SENSORS: usize = 16;
 
-/// To put out a sensor and make the topics of another takes milliseconds, and whoever can send can ask for it: so long it
-/// takes until one more may be, after as many as there is room for.
+/// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes milliseconds, and
+/// anyone who can send can cause it.
 const ALLOW_EVERY_NS: u64 = 250_000_000;
 
-/// So often late joiners get the last status, zones and background.
+/// Interval at which late joiners receive the last status, zones and background.
 const GREET_EVERY_NS: u64 = 100_000_000;
 
-/// Between two looks at what dead consumers left, as in the hub.
+/// Interval between cleanups after dead subscribers, as in the hub.
 const UPKEEP_NS: u64 = 5_000_000_000;
 
 impl<S: TopicStore> Republisher<S> {
-    /// Makes the publishing end of process `pid`, which makes topics in `store`, at `now_ns`.
+    /// Creates the publisher of process `pid` at `now_ns`. It creates topics in `store`.
     pub fn new(store: S, pid: u32, now_ns: u64) -> Republisher<S> {
         Republisher {
             sensors: Vec::new(),
             left_out: LeftOut::default(),
             displaced: 0,
-            no_room: NoRoom::default(),
             only_proven: false,
             candidates: Candidates::default(),
-            allowance: SENSORS,
+            allowance: MAX_SENSORS,
             allow_ns: now_ns,
             greet_ns: now_ns,
             upkeep_ns: now_ns.saturating_add(UPKEEP_NS),
@@ -105,12 +82,12 @@ impl<S: TopicStore> Republisher<S> {
         }
     }
 
-    /// Makes topics only for sensors whose gateway had the key, or has delivered for a second.
+    /// Creates topics only for sensors whose gateway has the key, or has delivered for a second.
     pub fn only_proven(self) -> Republisher<S> {
         Republisher { only_proven: true, ..self }
     }
 
-    /// A life of a gateway began with `head`: sensors that were published of the same epoch are another gateway's.
+    /// Handles the start of a gateway's run with `head`. Published sensors with the same epoch belong to another gateway.
     pub fn begun(&mut self, head: &Head, now: Stamp) {
         self.sensors
             .iter_mut()
@@ -118,12 +95,12 @@ impl<S: TopicStore> Republisher<S> {
             .for_each(|sensor| sensor.replaced(now));
     }
 
-    /// Takes what was announced by the gateway that is called `hub`: makes what is not there yet of its sensor. Returns the
-    /// sensor's name here, when all of it is there for the first time.
+    /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of its sensor. Returns the
+    /// sensor's name here once all of them exist.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are; the sensors that are there go on.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are not affected.
     pub fn announced(
         &mut self,
         announcement: &Announcement,
@@ -138,12 +115,13 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts why not. Makes its sensor as [`announced`](Self::announced) does if its gateway is known
-    /// to deliver with this sample. If there is no room for its sensor, another one may be removed for it.
+    /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as [`announced`](Self::announced)
+    /// does if its gateway is known to deliver since this sample. If there is no room for its sensor, another one may be
+    /// evicted.
     ///
     /// # Errors
     ///
-    /// As [`announced`](Self::announced).
+    /// Returns the same errors as [`announced`](Self::announced).
     pub fn sample(
         &mut self,
         sample: &RemoteSample<'_>,
@@ -151,7 +129,7 @@ impl<S: TopicStore> Republisher<S> {
         now: Stamp,
     ) -> Result<Option<String>, Failure> {
         let RemoteSample { remote, announced, is_proven, .. } = sample;
-        let head = &remote.datagram.head;
+        let head = &remote.head;
         let candidate = if *is_proven { self.candidates.take(head) } else { None };
         let made = match announced {
             Some(announce) if candidate.is_some() || self.may_make_room(head, announce) => {
@@ -165,13 +143,13 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Wakes the consumers of those sensors of which something was published since the last call.
+    /// Wakes the subscribers of sensors that have published something since the last call.
     pub fn wake(&mut self) {
         self.sensors.iter_mut().for_each(RemoteSensor::wake);
     }
 
-    /// What is due at `now_ns`: sensors that are silent, consumers that came or died. Everything that came before `read` was
-    /// taken, by the clocks of arrivals. A silence is said as of then: nobody knows yet what still waits.
+    /// Does what is due at `now_ns`: reports silent sensors, connects late joiners, and cleans up after dead subscribers.
+    /// Everything that arrived before `read` has been handled, so a silence is reported as of that time.
     pub fn look(&mut self, now_ns: u64, read: Stamp) {
         if now_ns >= self.greet_ns {
             self.greet_ns = now_ns + GREET_EVERY_NS;
@@ -179,7 +157,7 @@ impl<S: TopicStore> Republisher<S> {
         }
         if now_ns >= self.allow_ns {
             self.allow_ns = now_ns + ALLOW_EVERY_NS;
-            self.allowance = SENSORS.min(self.allowance + 1);
+            self.allowance = MAX_SENSORS.min(self.allowance + 1);
         }
         if now_ns >= self.upkeep_ns {
             self.upkeep_ns = now_ns + UPKEEP_NS;
@@ -192,22 +170,16 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter().map(RemoteSensor::failed).sum()
     }
 
-    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, at most [`LIVES`], and
-    /// the number of these samples.
-    pub fn no_room(&self) -> &[(u64, u64)] {
-        &self.no_room.0
-    }
-
     /// Returns the names of the sensors here.
     pub fn names(&self) -> Vec<&str> {
         self.sensors.iter().map(|sensor| sensor.name.as_str()).collect()
     }
 
-    /// `announce` came from the gateway that is called `hub`, or now a sample of the sensor that it announced: makes what is
-    /// not there yet of its sensor. The name of the sensor here, when all of it is there for the first time. Whoever had its
-    /// number before has it no more, even if there is no room for this one: no sensor's samples are ever another's.
+    /// Creates the missing topics of the sensor in `announce`, from the gateway that is called `hub`. Returns the sensor's name
+    /// here once all of them exist. A sensor that had its number before loses it, even if there is no room for this one, so
+    /// that no sample is published under another sensor's name.
     ///
-    /// A sample puts out another sensor where there is no room, but none that is known to deliver; an announcement does not.
+    /// If there is no room, a sample evicts another sensor that is not known to deliver. An announcement does not.
     fn make(
         &mut self,
         head: &Head,
@@ -223,7 +195,7 @@ impl<S: TopicStore> Republisher<S> {
         }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if let Some(at) = at {
-            // Its topics stay, even if there is no room for more.
+            // Its topics stay, even if there is no room for others.
             self.sensors[at].announced(head, announce, arrival);
         }
         if self.only_proven && !is_proven {
@@ -232,7 +204,7 @@ impl<S: TopicStore> Republisher<S> {
         }
         while at.is_none() && self.is_full(announce) {
             match self.least(arrival).filter(|_| arrival.delivers && self.allowance > 0) {
-                Some(least) => self.put_out(least, now),
+                Some(least) => self.evict(least, now),
                 None => return Ok(None),
             }
         }
@@ -255,7 +227,7 @@ impl<S: TopicStore> Republisher<S> {
         };
         if !missing.is_empty() {
             let sensor = &mut self.sensors[at];
-            // All of them or none.
+            // All topics are created, or none.
             let made = missing.iter().try_for_each(|&topic| sensor.add(topic));
             made.inspect_err(|_| missing.iter().for_each(|&topic| sensor.remove(topic)))?;
         }
@@ -263,15 +235,15 @@ impl<S: TopicStore> Republisher<S> {
         Ok((!is_told).then_some(name))
     }
 
-    /// What comes with `head` is of no sensor here, and one may be put out for it.
+    /// Returns whether the sensor that sent `head` is not published, and another one may be evicted for it.
     fn may_make_room(&self, head: &Head, announce: &Announce) -> bool {
         let is_here = || self.sensors.iter().any(|sensor| sensor.is(head));
         self.allowance > 0 && !is_here() && self.is_full(announce)
     }
 
-    /// Returns whether there is no place, or no memory, for one more sensor with the topics of `announce`.
+    /// Returns whether there is no room for one more sensor with the topics of `announce`.
     fn is_full(&self, announce: &Announce) -> bool {
-        self.sensors.len() == SENSORS || !self.store.fits(&topics(announce))
+        self.sensors.len() == MAX_SENSORS || !self.store.fits(&topics(announce))
     }
 
     /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a candidate. Samples
@@ -290,7 +262,7 @@ impl<S: TopicStore> Republisher<S> {
     /// Publishes `sample`, if it can be.
     fn publish(&mut self, sample: &RemoteSample<'_>) {
         let RemoteSample { remote, announced, is_proven, .. } = sample;
-        let head = &remote.datagram.head;
+        let head = &remote.head;
         let reason = if remote.late {
             &mut self.left_out.late
         } else if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) {
@@ -299,21 +271,17 @@ impl<S: TopicStore> Republisher<S> {
                 Outcome::NoTopic if !sensor.is_announced(remote.topic) => &mut self.left_out.unannounced,
                 Outcome::NoTopic if self.only_proven && !is_proven => &mut self.left_out.unproven,
                 Outcome::NoTopic if self.store.fits(&[remote.topic]) => &mut self.left_out.shortage,
-                Outcome::NoTopic | Outcome::NoRoom => {
-                    self.no_room.count(head.hub);
-                    &mut self.left_out.no_room
-                }
+                Outcome::NoTopic | Outcome::NoRoom => &mut self.left_out.no_room,
             }
         } else if let Some(announce) = announced {
             if self.only_proven && !is_proven {
                 self.candidates.add(head).keep(remote);
                 &mut self.left_out.unproven
-            } else if self.sensors.len() == SENSORS {
+            } else if self.sensors.len() == MAX_SENSORS {
                 &mut self.left_out.capacity
             } else if self.store.fits(&topics(announce)) {
                 &mut self.left_out.shortage
             } else {
-                self.no_room.count(head.hub);
                 &mut self.left_out.no_room
             }
         } else {
@@ -322,14 +290,14 @@ impl<S: TopicStore> Republisher<S> {
         *reason += 1;
     }
 
-    /// Where the sensor stands that is put out for another of which this came.
+    /// Returns the position of the sensor that is evicted next for another one.
     fn least(&self, arrival: Arrival) -> Option<usize> {
         let may_go = |at: &usize| self.sensors[*at].standing.may_go(arrival);
         (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].standing.worth_ns())
     }
 
-    /// Takes the sensor away, after a last word to who follows it.
-    fn put_out(&mut self, at: usize, now: Stamp) {
+    /// Removes the sensor, after it has published that it is silent.
+    fn evict(&mut self, at: usize, now: Stamp) {
         self.sensors.remove(at).replaced(now);
         self.displaced += 1;
         self.allowance -= 1;
@@ -340,6 +308,158 @@ impl<S: TopicStore> Republisher<S> {
 fn topics(announce: &Announce) -> Vec<Topic> {
     let is_announced = |topic: &Topic| announce.topics().iter().any(|one| one.topic == topic.number());
     Topic::ALL.into_iter().filter(is_announced).collect()
+}
+
+/// Place where topics of sensors are created: shared memory, or a model of it.
+pub trait TopicStore {
+    /// Topics of one sensor. Dropping them removes them.
+    type Sensor: SensorTopics;
+
+    /// Checks that there is room for `topics` of one more sensor.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if there is not.
+    fn check_room(&self, topics: &[Topic]) -> Result<(), Failure>;
+
+    /// Returns whether the memory that remote sensors may use has room for `topics` of one more sensor.
+    fn fits(&self, topics: &[Topic]) -> bool {
+        let _ = topics;
+        true
+    }
+
+    /// Creates a sensor without topics.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or another error of the store.
+    fn sensor(&self, name: &str) -> Result<Self::Sensor, Failure>;
+
+    /// Cleans up after dead subscribers.
+    fn clean_up(&self);
+}
+
+/// Topics of one sensor in a store. Samples of other topics are neither sent nor skipped.
+pub trait SensorTopics {
+    /// Creates `topic`, which does not exist.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short, or another error of the store.
+    fn add(&mut self, topic: Topic) -> Result<(), Failure>;
+
+    /// Removes `topic`.
+    fn remove(&mut self, topic: Topic);
+
+    /// Returns whether the memory that remote sensors may use has room for `topic` with samples as long as `payload`.
+    fn fits(&self, topic: Topic, payload: CheckedPayload<'_>) -> bool {
+        let _ = (topic, payload);
+        true
+    }
+
+    /// Uses up `count` numbers of `topic` without a sample.
+    fn skip(&mut self, topic: Topic, count: u64);
+
+    /// Publishes a sample with `header`, but with the next number of the topic. A sample that fails is counted in
+    /// [`failed`](Self::failed), and uses its number up.
+    fn send(&mut self, topic: Topic, header: &Header, payload: CheckedPayload<'_>);
+
+    /// Sends the history of `topic` to late joiners.
+    fn connect(&self, topic: Topic);
+
+    /// Wakes the subscribers of all topics.
+    fn wake(&self, why: Wake);
+
+    /// Returns the number of samples for which there was no memory.
+    fn failed(&self) -> u64;
+}
+
+/// Sensors that were announced before their gateway was known to deliver, the last ones. They have no topics yet, but the last
+/// sample of each topic with a history is kept: a background, for example, is sent only once.
+#[derive(Default)]
+pub(super) struct Candidates(VecDeque<Candidate>);
+
+/// A sensor, and its samples that late subscribers would get.
+pub(super) struct Candidate {
+    /// Gateway, its run, and the sensor's number.
+    source: (u64, u32, u8),
+    /// At most one of each topic.
+    kept: Vec<Kept>,
+}
+
+/// A sample that is not published yet.
+struct Kept {
+    head: Head,
+    topic: Topic,
+    bytes: Vec<u8>,
+    room: usize,
+    boot: u64,
+    arrival_ns: u64,
+    age_ns: Option<u64>,
+}
+
+/// Maximum number of candidates. Their samples take up to 17 kB each.
+const MAX_CANDIDATES: usize = 4 * MAX_SENSORS;
+
+impl Candidates {
+    /// Adds the sensor that sent `head`, unless it is a candidate already.
+    pub(super) fn add(&mut self, head: &Head) -> &mut Candidate {
+        let source = source(head);
+        let at = match self.0.iter().position(|candidate| candidate.source == source) {
+            Some(at) => at,
+            None => {
+                self.put_back(Candidate { source, kept: Vec::new() });
+                self.0.len() - 1
+            }
+        };
+        &mut self.0[at]
+    }
+
+    /// Adds `candidate`, which was not one. The oldest one has to go if there are too many.
+    pub(super) fn put_back(&mut self, candidate: Candidate) {
+        if self.0.len() == MAX_CANDIDATES {
+            self.0.pop_front();
+        }
+        self.0.push_back(candidate);
+    }
+
+    /// Removes the sensor that sent `head`, and returns it if it was a candidate.
+    pub(super) fn take(&mut self, head: &Head) -> Option<Candidate> {
+        let source = source(head);
+        let at = self.0.iter().position(|candidate| candidate.source == source)?;
+        self.0.remove(at)
+    }
+}
+
+impl Candidate {
+    /// Keeps `remote` in place of the last sample of its topic, if the topic has a history.
+    pub(super) fn keep(&mut self, remote: &Remote<'_>) {
+        let &Remote { topic, head, payload, boot, arrival_ns, age_ns, .. } = remote;
+        if topic.row().kept > 0 {
+            self.kept.retain(|kept| kept.topic != topic);
+            let CheckedPayload { bytes, room } = payload;
+            self.kept.push(Kept { head, topic, bytes: bytes.to_vec(), room, boot, arrival_ns, age_ns });
+        }
+    }
+
+    /// Returns the samples that are kept, each as it was received.
+    pub(super) fn samples(&self) -> impl Iterator<Item = Remote<'_>> {
+        self.kept.iter().map(|kept| Remote {
+            topic: kept.topic,
+            head: kept.head,
+            payload: CheckedPayload { bytes: &kept.bytes, room: kept.room },
+            boot: kept.boot,
+            arrival_ns: kept.arrival_ns,
+            age_ns: kept.age_ns,
+            late: false,
+            // Nothing is a candidate if there is a key.
+            authenticated: false,
+        })
+    }
+}
+
+fn source(head: &Head) -> (u64, u32, u8) {
+    (head.hub, head.epoch, head.sensor)
 }
 
 #[cfg(test)]
@@ -393,7 +513,7 @@ mod tests {
 
         fn skip(&mut self, _: Topic, _: u64) {}
 
-        fn send(&mut self, _: Topic, _: &Header, _: &[u8]) {
+        fn send(&mut self, _: Topic, _: &Header, _: CheckedPayload<'_>) {
             self.0.sent.set(self.0.sent.get() + 1);
         }
 
@@ -469,7 +589,7 @@ mod tests {
 
     #[test]
     fn publishes_sensor_once_its_gateway_has_delivered_for_a_second() {
-        let mut network = Network::new(SENSORS);
+        let mut network = Network::new(MAX_SENSORS);
         assert_eq!(
             [network.announce(5, 0), network.zones(5, 0), network.announce(5, 900)],
             [None, None, None]
@@ -485,7 +605,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_samples_without_room_by_gateway() {
+    fn counts_samples_without_room() {
         let mut network = Network::new(1);
         network.announce(5, 0);
         assert_eq!([network.zones(5, 0), network.zones(5, 1_000)], [None, Some("h5.front".to_owned())]);
@@ -495,7 +615,7 @@ mod tests {
         for ms in [2_000, 2_100, 2_200] {
             assert_eq!(network.zones(6, ms), None);
         }
-        assert_eq!((network.republisher.no_room(), network.republisher.left_out.no_room), (&[(6, 3)][..], 3));
+        assert_eq!(network.republisher.left_out.no_room, 3);
         assert_eq!((network.republisher.names(), network.republisher.displaced), (vec!["h5.front"], 0));
         // A silent sensor returns its memory.
         assert_eq!(network.zones(6, 5_000), Some("h6.front".to_owned()));

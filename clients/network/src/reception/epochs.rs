@@ -1,51 +1,54 @@
-//! The greatest epochs of the gateways that had the key, over restarts of the listener: what an older life sent is not
-//! believed again. Losing the file loses no more than that. Refuses to know how they were learned.
+//! Keeps the highest epochs of the gateways that have the key in a file, so that datagrams of an older run are refused even
+//! after a restart of the listener.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-use crate::lan::Key;
-use crate::lan::incoming::GATEWAYS;
+use crate::lan::{Key, MAX_EPOCHS};
 use scanhub_schema::Failure;
 use scanhub_shm::StateDirectory;
 
-/// The file in which they are kept; nothing where there is no place for one.
+/// File with the epochs. Without a state directory, they are not kept.
 pub(super) struct Epochs {
     state: Option<StateDirectory>,
     name: String,
 }
 
 impl Epochs {
-    /// Those of gateways that have `key`.
+    /// Returns the file for gateways with `key`.
     pub(super) fn of(key: &Key, state: Option<StateDirectory>) -> Epochs {
         Epochs { state, name: format!("heard-{}", key.name()) }
     }
 
-    /// What was kept.
+    /// Returns the epochs. Invalid lines are ignored.
     ///
-    /// As [`StateDirectory::read`]; what is no such line says nothing.
+    /// # Errors
+    ///
+    /// Returns the same errors as [`StateDirectory::read`].
     pub(super) fn read(&self) -> Result<HashMap<u64, u32>, Failure> {
-        let text = self.state.as_ref().map(|state| state.read(&self.name, LONGEST)).transpose()?.flatten();
+        let text = self.state.as_ref().map(|state| state.read(&self.name, MAX_LEN)).transpose()?.flatten();
         Ok(text.unwrap_or_default().lines().filter_map(parse).collect())
     }
 
-    /// Keeps `epochs`, and what another listener kept meanwhile, of too many those.
+    /// Keeps `epochs`, and those that another listener has kept, as far as there is room.
     ///
-    /// As [`StateDirectory::lock`] and [`StateDirectory::write`].
+    /// # Errors
+    ///
+    /// Returns the same errors as [`StateDirectory::lock`] and [`StateDirectory::write`].
     pub(super) fn keep(&self, epochs: &HashMap<u64, u32>) -> Result<(), Failure> {
         let Some(state) = &self.state else { return Ok(()) };
-        // Until the end of this: two listeners that merge at once would forget what one of them adds.
-        let _turn = state.lock(&self.name)?;
-        // One that cannot be used is replaced.
+        // Without the lock, two listeners that merge at once would lose the epochs of one of them.
+        let _lock = state.lock(&self.name)?;
+        // A file that cannot be read is replaced.
         let mut all = self.read().unwrap_or_default();
         for (&hub, &epoch) in epochs {
             let kept = all.entry(hub).or_default();
             *kept = epoch.max(*kept);
         }
         let mut all: Vec<_> = all.into_iter().collect();
-        // Those that this listener knows, and of the others the youngest lives.
+        // First those of this listener, then the latest runs of others.
         all.sort_unstable_by_key(|&(hub, epoch)| (!epochs.contains_key(&hub), Reverse(epoch), hub));
-        all.truncate(GATEWAYS);
+        all.truncate(MAX_EPOCHS);
         let mut lines: Vec<String> = all.iter().map(|(hub, epoch)| format!("{hub:016x} {epoch}\n")).collect();
         lines.sort_unstable();
         state.write(&self.name, &lines.concat())
@@ -57,8 +60,8 @@ fn parse(line: &str) -> Option<(u64, u32)> {
     Some((u64::from_str_radix(hub, 16).ok()?, epoch.parse().ok()?))
 }
 
-/// More gateways than one key has.
-const LONGEST: u64 = 1 << 20;
+/// Maximum length of the file, in bytes: more than it has with all epochs.
+const MAX_LEN: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {
@@ -85,11 +88,15 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path().join("d"))));
         let many = |from: u64, count: u64| (from..from + count).map(|hub| (hub, hub as u32 + 1)).collect();
-        epochs.keep(&many(0, GATEWAYS as u64)).unwrap();
+        epochs.keep(&many(0, MAX_EPOCHS as u64)).unwrap();
         epochs.keep(&many(50_000, 10)).unwrap();
         epochs.keep(&HashMap::from([(7, 1)])).unwrap();
         let kept = epochs.read().unwrap();
-        assert_eq!((kept.len(), kept.contains_key(&10)), (GATEWAYS, false), "the oldest lives are forgotten");
+        assert_eq!(
+            (kept.len(), kept.contains_key(&10)),
+            (MAX_EPOCHS, false),
+            "the oldest lives are forgotten"
+        );
         assert_eq!((kept.get(&7), kept.get(&50_009)), (Some(&1), Some(&50_010)));
     }
 

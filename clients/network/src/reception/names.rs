@@ -1,16 +1,18 @@
-//! What gateways are called here: by their number, or by the name that the user gives one; and which of them are wanted.
+//! Selection of the gateways and topics that a receiver takes, and the names that the user gave to gateways.
 
-use scanhub_schema::datagram::Datagram;
-use scanhub_schema::{Failure, Kind, check_sensor};
+use scanhub_schema::{Failure, Kind, Topic, check_sensor};
+use scanhub_verbs::selection::Word;
 
-/// Names that the user gave.
+/// Names that the user gave to gateways.
 #[derive(Default)]
 pub(super) struct Names(Vec<(String, u64)>);
 
 impl Names {
-    /// From `NAME=HUB`, HUB being 16 hex digits as in all output.
+    /// Parses names of the form `NAME=HUB`. HUB is 16 hex digits as in all output.
     ///
-    /// [`Kind::Configuration`] if a name or a number is not possible, or if one is given twice.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if a name or a number is not valid, or if one is given twice.
     pub(super) fn parse(given: &[String]) -> Result<Names, Failure> {
         let mut names: Vec<(String, u64)> = Vec::new();
         for text in given {
@@ -32,29 +34,20 @@ impl Names {
         Ok(Names(names))
     }
 
-    /// What `hub` is called.
+    /// Returns the name of `hub`, or its 16 hex digits.
     pub(super) fn of(&self, hub: u64) -> String {
         let given = self.0.iter().find(|(_, known)| *known == hub);
         given.map_or_else(|| format!("{hub:016x}"), |(name, _)| name.clone())
     }
-}
 
-/// The hub with these 16 hex digits.
-fn number(text: &str) -> Option<u64> {
-    let is_hex = text.len() == 16 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
-    u64::from_str_radix(text, 16).ok().filter(|_| is_hex)
-}
-
-/// The hubs that are wanted; none: all.
-pub(super) struct Hubs(Vec<u64>);
-
-impl Hubs {
-    /// From `given`: each a hub's name in `names`, or its 16 hex digits.
+    /// Returns the hubs in `given`, each by its name or its 16 hex digits.
     ///
-    /// [`Kind::Configuration`] if one is neither.
-    pub(super) fn parse(given: &[String], names: &Names) -> Result<Hubs, Failure> {
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if one is neither.
+    pub(super) fn hubs(&self, given: &[String]) -> Result<Vec<u64>, Failure> {
         let hub = |text: &String| {
-            let named = names.0.iter().find(|(name, _)| name == text).map(|(_, hub)| *hub);
+            let named = self.0.iter().find(|(name, _)| name == text).map(|(_, hub)| *hub);
             named.or_else(|| number(text)).ok_or_else(|| {
                 let what = format!("--hub {text}: neither 16 hex digits nor a name that --name gives");
                 let hint = format!(
@@ -64,38 +57,54 @@ impl Hubs {
                 Failure::new(Kind::Configuration, what, hint)
             })
         };
-        given.iter().map(hub).collect::<Result<_, _>>().map(Hubs)
-    }
-
-    /// These bytes are not a whole datagram of another hub.
-    pub(super) fn want(&self, bytes: &[u8]) -> bool {
-        let is_wanted = |datagram: Datagram<'_>| self.0.contains(&datagram.head.hub);
-        self.0.is_empty() || Datagram::read(bytes).map_or(true, is_wanted)
+        given.iter().map(hub).collect()
     }
 }
 
-/// What a hub may be called: its sensors are `HUB.SENSOR`, and each half has the same form; `robot` stands for all.
+/// Returns the hub with these 16 hex digits.
+fn number(text: &str) -> Option<u64> {
+    let is_hex = text.len() == 16 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    u64::from_str_radix(text, 16).ok().filter(|_| is_hex)
+}
+
+/// Form of a hub's name. Its sensors are called `HUB.SENSOR`, and both halves have the same form. `robot` means all sensors.
 const HUB_NAMES: &str = "1 to 24 of a-z, 0-9, _ and -, but not robot";
+
+/// Returns the topics that `texts` name, each as `*/TOPIC`, or all if there are none.
+///
+/// # Errors
+///
+/// Returns [`Kind::Usage`] if there is no such topic, or if a sensor or a thinning factor is named: a receiver counts all
+/// samples of a topic, and learns the names of sensors only from announcements.
+pub fn received_topics(texts: &[String]) -> Result<Vec<Topic>, Failure> {
+    let mut wanted = Vec::new();
+    for text in texts {
+        let refuse =
+            |what: &str, hint: &str| Err(Failure::new(Kind::Usage, format!("topic {text} {what}"), hint));
+        if let Some((topic, _)) = text.split_once(':') {
+            let hint = format!("--topic {topic} here, and --topic {text} where it is sent");
+            return refuse("cannot be thinned where it is received", &hint);
+        }
+        let word = Word::parse(text)?;
+        if word.sensor.is_some() {
+            let topic = word.topic.map_or("*", Topic::name);
+            let hint = format!("*/{topic} is received of all sensors, of those hubs that --hub names");
+            return refuse("is of one sensor, and --publish takes topics of all", &hint);
+        }
+        wanted.extend(Topic::ALL.into_iter().filter(|topic| word.topic.is_none_or(|named| named == *topic)));
+    }
+    Ok(Topic::ALL.into_iter().filter(|topic| texts.is_empty() || wanted.contains(topic)).collect())
+}
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    use scanhub_schema::datagram::{HEAD, Head};
-
     #[test]
-    fn hubs_are_wanted_by_number_and_by_name() {
+    fn hubs_are_selected_by_number_and_by_name() {
         let names = Names::parse(&["robot1=00000000000000ab".into()]).unwrap();
-        let parse =
-            |texts: &[&str]| Hubs::parse(&texts.iter().map(|&text| text.into()).collect::<Vec<_>>(), &names);
-        let wanted = |texts: &[&str], hub| {
-            let mut buffer = [0; HEAD];
-            let bytes = Head { hub, ..Head::default() }.seal(&mut buffer, 0).unwrap();
-            parse(texts).unwrap().want(bytes)
-        };
-        let both = ["robot1", "00000000000000AC"];
-        assert_eq!([0xab, 0xac, 0xad].map(|hub| wanted(&both, hub)), [true, true, false]);
-        assert!(wanted(&[], 0xad) && parse(&both).unwrap().want(b"what is broken is to be counted"));
+        let parse = |texts: &[&str]| names.hubs(&texts.iter().map(|&text| text.into()).collect::<Vec<_>>());
+        assert_eq!(parse(&["robot1", "00000000000000AC"]), Ok(vec![0xab, 0xac]));
         for bad in ["robot2", "ab", "", "+0000000000000ab"] {
             let failure = parse(&[bad]).map(drop).unwrap_err();
             assert!(failure.kind == Kind::Configuration && failure.hint.contains("--name"), "{failure}");
@@ -122,6 +131,31 @@ mod tests {
                 Err(Kind::Configuration),
                 "{bad:?}"
             );
+        }
+    }
+
+    fn received(texts: &[&str]) -> Result<Vec<Topic>, Failure> {
+        received_topics(&texts.iter().map(|&text| text.to_owned()).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn topics_of_all_sensors_are_received() {
+        assert_eq!(received(&[]), Ok(Topic::ALL.to_vec()));
+        assert_eq!(received(&["*/*"]), Ok(Topic::ALL.to_vec()));
+        let two = Topic::ALL.into_iter().filter(|topic| matches!(topic, Topic::Scan | Topic::Zones));
+        assert_eq!(received(&["*/zones", "*/scan", "*/zones"]), Ok(two.collect()));
+    }
+
+    #[test]
+    fn what_cannot_be_received_alone_is_refused() {
+        for (text, said) in [
+            ("front/scan", "*/scan"),
+            ("robot1.front/*", "*/*"),
+            ("*/scan:every=4", "where it is sent"),
+            ("*/scam", "scan"),
+        ] {
+            let failure = received(&[text]).unwrap_err();
+            assert!(failure.kind == Kind::Usage && failure.hint.contains(said), "{failure}");
         }
     }
 }

@@ -1,59 +1,57 @@
-//! Where remote sensors are published: the shared memory of a domain. Refuses to know which of them, and when.
+//! Publishes remote sensors in the shared memory of a domain, within a budget of memory.
 
-mod any_publisher;
-mod budget;
-
+use std::cell::Cell;
 use std::rc::Rc;
 
-use crate::lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
+use scanhub_schema::datagram::Packed;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{BEAMS, Contents, Failure, Header, Kind, Telegram, Topic, Wake};
-use scanhub_shm::Domain;
 use scanhub_shm::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
+use scanhub_shm::{Domain, Payload};
 
-use any_publisher::AnyPublisher;
-use budget::{Budget, Share};
+use crate::lan::incoming::CheckedPayload;
+use crate::lan::republish::{Republisher, SensorTopics, TopicStore};
 
-/// The publishing end of all remote sensors of a domain.
+/// Publisher of all remote sensors in a domain.
 pub(super) type Publication = Republisher<SharedMemory>;
 
-/// The shared memory of a domain. Remote sensors may use a part of it.
+/// Shared memory of a domain, of which remote sensors may use a part.
 pub(super) struct SharedMemory {
     session: PublishSession,
     budget: Rc<Budget>,
 }
 
-/// The topics of one sensor in shared memory. How long its samples are is not announced: topics are made for an LMS, and
-/// made anew where a sample comes that is longer. Their consumers stay.
+/// Topics of one sensor in shared memory. Announcements do not have the length of samples: topics are created for an LMS, and
+/// created again if a longer sample arrives. Their subscribers stay.
 pub(super) struct SharedTopics {
-    /// One for each of [`Topic::ALL`].
+    /// By topic.
     topics: [Option<Made>; Topic::ALL.len()],
-    /// The next number of those that were there, and could not be made anew: there was no memory.
+    /// Next number of each topic that could not be created again because memory was short.
     gone: [Option<u64>; Topic::ALL.len()],
-    /// What the next one is made for: what is known of the samples so far.
+    /// Limits of the next topic, from the samples so far.
     limits: TopicLimits,
-    /// How often that became more.
+    /// Number of times that the limits were raised.
     widened: u32,
-    /// Samples without memory, of topics that were made anew or are gone.
+    /// Samples without memory of topics that were created again or no longer exist.
     failed: u64,
-    // Behind the topics: it wakes their consumers.
+    // After the topics, because it wakes their subscribers.
     sensor: SensorPublisher,
     budget: Rc<Budget>,
     /// Memory of the doorbell and the event.
     _share: Share,
 }
 
-/// A topic, and what it was made for.
+/// A topic and the limits that it was created with.
 struct Made {
     publisher: AnyPublisher,
     limits: TopicLimits,
-    // Behind the publisher, whose memory it counts.
+    // After the publisher, whose memory it counts.
     share: Share,
 }
 
-/// So often topics are made anew for exactly what came, then for the longest samples that there can be: whoever can send
-/// could ask for a beam more with each sample.
+/// Number of times that limits are raised to exactly what is needed. After that, they are raised to the maximum, because a
+/// sender could require one more beam with each sample.
 const WIDENED_EXACTLY: u32 = 4;
 
 /// Takes the lock of the domain's listener. All topics are created with `limits`, and take at most `memory` bytes together.
@@ -62,7 +60,7 @@ const WIDENED_EXACTLY: u32 = 4;
 /// the lock. Returns [`Kind::Short`] if there is no memory for even one sensor, and [`Kind::Failed`] if shared memory
 /// refuses.
 pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<Publication, Failure> {
-    // With fewer, fewer consumers can attach.
+    // With a lower limit, fewer subscribers can attach.
     let _ = raise_descriptor_limit();
     let needed = sensor_bytes(&Topic::ALL, &limits);
     if memory < needed {
@@ -111,11 +109,12 @@ impl TopicStore for SharedMemory {
 
 impl SharedTopics {
     /// Returns the limits with which `topic` has room for `payload`. `None` if it has room.
-    fn wider(&self, topic: Topic, payload: &[u8]) -> Option<TopicLimits> {
+    fn wider(&self, topic: Topic, payload: CheckedPayload<'_>) -> Option<TopicLimits> {
         let mut limits = self.topics[topic as usize].as_ref()?.limits;
-        if !AnyPublisher::widen(topic, &mut limits, payload) {
+        if payload.room <= topic.longest(&limits) {
             return None;
         }
+        AnyPublisher::widen(topic, &mut limits, payload.bytes);
         let known = TopicLimits {
             beams: limits.beams.max(self.limits.beams),
             contents: limits.contents | self.limits.contents,
@@ -130,7 +129,7 @@ impl SharedTopics {
     }
 
     /// Creates `topic` again if it has no room for `payload`. A sample that is still too long is counted when it is published.
-    fn make_room(&mut self, topic: Topic, payload: &[u8]) {
+    fn make_room(&mut self, topic: Topic, payload: CheckedPayload<'_>) {
         let Some(limits) = self.wider(topic, payload) else { return };
         if !has_memory(topic, &limits) {
             return;
@@ -141,7 +140,7 @@ impl SharedTopics {
             return;
         };
         let (next, failed) = (publisher.next_number(), publisher.failed());
-        // One at a time publishes a topic.
+        // A topic has one publisher at a time.
         drop((publisher, share));
         self.failed += failed;
         self.topics[topic as usize] =
@@ -150,7 +149,7 @@ impl SharedTopics {
         self.skip(topic, next);
     }
 
-    /// Makes `topic` again that is gone, as soon as there is memory.
+    /// Creates `topic` again, which no longer exists, once there is memory.
     fn make_again(&mut self, topic: Topic) {
         let Some(next) = self.gone[topic as usize] else { return };
         if self.budget.has(topic_bytes(topic, &self.limits))
@@ -177,7 +176,7 @@ impl SensorTopics for SharedTopics {
         Ok(())
     }
 
-    fn fits(&self, topic: Topic, payload: &[u8]) -> bool {
+    fn fits(&self, topic: Topic, payload: CheckedPayload<'_>) -> bool {
         let Some(limits) = self.wider(topic, payload) else { return true };
         let before = self.topics[topic as usize].as_ref().map_or(0, |made| made.share.bytes());
         self.budget.has(topic_bytes(topic, &limits).saturating_sub(before))
@@ -196,7 +195,7 @@ impl SensorTopics for SharedTopics {
         }
     }
 
-    fn send(&mut self, topic: Topic, header: &Header, payload: &[u8]) {
+    fn send(&mut self, topic: Topic, header: &Header, payload: CheckedPayload<'_>) {
         self.make_again(topic);
         self.make_room(topic, payload);
         if let Some(made) = &mut self.topics[topic as usize] {
@@ -214,7 +213,7 @@ impl SensorTopics for SharedTopics {
     }
 
     fn wake(&self, why: Wake) {
-        // Those that cannot be woken look by themselves ten times a second.
+        // Subscribers that cannot be woken poll ten times a second.
         let _ = self.sensor.wake(why);
     }
 
@@ -223,13 +222,140 @@ impl SensorTopics for SharedTopics {
     }
 }
 
-/// Returns the memory of a `topic` that is made as `limits` say, without that of its sensor's event.
+/// Returns the memory of a `topic` with these `limits`, without that of its sensor's event.
 fn topic_bytes(topic: Topic, limits: &TopicLimits) -> u64 {
     sensor_bytes(&[topic], limits) - sensor_bytes(&[], limits)
 }
 
-/// Whether there is memory for one more `topic` that is made as `limits` say.
+/// Returns whether there is memory for one more `topic` with these `limits`.
 fn has_memory(topic: Topic, limits: &TopicLimits) -> bool {
     let needed = sensor_bytes(&[topic], limits);
     check_memory(needed, needed).is_ok()
+}
+
+/// Bytes of shared memory, and the number of those in use.
+#[derive(Debug)]
+struct Budget {
+    bytes: u64,
+    used: Cell<u64>,
+}
+
+/// Part of a budget that is in use. Dropping it returns it.
+#[derive(Debug)]
+struct Share {
+    budget: Rc<Budget>,
+    bytes: u64,
+}
+
+impl Budget {
+    /// Creates a budget of this number of bytes.
+    fn new(bytes: u64) -> Budget {
+        Budget { bytes, used: Cell::new(0) }
+    }
+
+    /// Returns whether `bytes` are left.
+    fn has(&self, bytes: u64) -> bool {
+        self.used.get().saturating_add(bytes) <= self.bytes
+    }
+
+    /// Takes `bytes`. The caller has checked that they are left.
+    fn take(self: &Rc<Budget>, bytes: u64) -> Share {
+        self.used.set(self.used.get() + bytes);
+        Share { budget: self.clone(), bytes }
+    }
+}
+
+impl Share {
+    /// Returns its size.
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+}
+
+impl Drop for Share {
+    fn drop(&mut self) {
+        self.budget.used.set(self.budget.used.get() - self.bytes);
+    }
+}
+
+/// A publisher of any payload that takes it as it is in a datagram.
+trait PublishPacked {
+    fn publish(&mut self, header: &Header, payload: CheckedPayload<'_>);
+}
+
+impl<P: Payload + Packed + ?Sized> PublishPacked for scanhub_client::Publication<P> {
+    fn publish(&mut self, header: &Header, CheckedPayload { bytes, room }: CheckedPayload<'_>) {
+        // The topic counts what fails.
+        let _ = self.send_len_with(header, room, |sample| {
+            let _ = sample.fill(bytes, room);
+        });
+    }
+}
+
+/// Generates the publisher of any topic from the table of topics.
+macro_rules! publishers {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        /// Publisher of any topic.
+        enum AnyPublisher { $($topic(scanhub_client::Publication<scanhub_schema::payload_type!($payload)>),)* }
+
+        impl AnyPublisher {
+            /// Creates `topic` of `sensor` with these `limits`.
+            fn new(
+                topic: Topic,
+                sensor: &SensorPublisher,
+                limits: &TopicLimits,
+            ) -> Result<AnyPublisher, Failure> {
+                Ok(match topic { $(Topic::$topic => AnyPublisher::$topic(sensor.topic_for(limits)?),)* })
+            }
+
+            /// Raises `limits` until `topic` has room for `payload`.
+            fn widen(topic: Topic, limits: &mut TopicLimits, payload: &[u8]) {
+                match topic { $(
+                    Topic::$topic => <scanhub_schema::payload_type!($payload)>::widen(limits, payload),
+                )* }
+            }
+
+            fn publish(&mut self, header: &Header, payload: CheckedPayload<'_>) {
+                match self { $(AnyPublisher::$topic(topic) => PublishPacked::publish(topic, header, payload),)* }
+            }
+
+            /// Uses up `count` numbers without a sample.
+            fn skip(&mut self, count: u64) {
+                match self { $(AnyPublisher::$topic(topic) => topic.skip(count),)* }
+            }
+
+            /// Returns the number of the next sample.
+            fn next_number(&self) -> u64 {
+                match self { $(AnyPublisher::$topic(topic) => topic.next_number(),)* }
+            }
+
+            /// Connects late joiners, and sends them the history.
+            fn connect(&self) {
+                match self { $(AnyPublisher::$topic(topic) => topic.connect(),)* }
+            }
+
+            /// Returns the number of samples for which there was no memory.
+            fn failed(&self) -> u64 {
+                match self { $(AnyPublisher::$topic(topic) => topic.failed(),)* }
+            }
+        }
+    };
+}
+
+scanhub_schema::for_each_topic!(publishers);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn share_returns_to_the_budget() {
+        let budget = Rc::new(Budget::new(100));
+        let shares = [budget.take(60), budget.take(40)];
+        assert!(budget.has(0) && !budget.has(1));
+        let [first, second] = shares;
+        drop(first);
+        assert!(budget.has(60) && !budget.has(61) && !budget.has(u64::MAX));
+        assert_eq!(second.bytes(), 40);
+    }
 }

@@ -1,25 +1,24 @@
-//! What a receiver says beside samples: that it hears, what went wrong, and the account of everything that came and did
-//! not.
+//! Output of a receiver: its samples as lines, notices about problems, and the counters of everything that arrived and
+//! did not.
 
-mod classes;
+use std::io::{self, Write};
+use std::path::Path;
 
-use std::io::Write;
-
-use crate::lan::incoming::{PeerTable, Remote};
-use crate::lan::{Row, StreamStats};
-use scanhub_schema::Topic;
-use scanhub_schema::datagram::{Announce, DatagramError, Head};
+use scanhub_schema::datagram::{Announce, DatagramError, Head, PORT};
+use scanhub_schema::{Header, Topic};
 use scanhub_shm::Domain;
+use scanhub_verbs::json;
+use scanhub_verbs::output::{End, Output, table};
+use scanhub_verbs::show::{Keys, Show};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use super::names::Names;
 use super::publish::Publication;
-use super::remote::{self, id};
-use classes::{NoRoom, Notice, Published, Ready, Sums};
-use scanhub_verbs::output::{End, Output, table};
+use crate::lan::incoming::Remote;
+use crate::lan::{EvictedTotals, GatewayTable, Row};
 
-/// The classes of an account, by the network that it is of.
+/// Names of the classes of counters, which depend on the network.
 #[derive(Clone, Copy, Debug)]
 pub struct Words {
     row: &'static str,
@@ -27,12 +26,12 @@ pub struct Words {
     given_up: &'static str,
     published: &'static str,
     no_room: &'static str,
-    /// Whether it is told how many samples senders replaced by newer ones.
+    /// Whether the counters include samples that senders replaced by newer ones.
     tells_replaced: bool,
 }
 
 impl Words {
-    /// Datagrams of a LAN.
+    /// Classes of `listen`.
     pub const LAN: Words = Words {
         row: "lan",
         refused: "lan_refused",
@@ -41,7 +40,7 @@ impl Words {
         no_room: "lan_no_room",
         tells_replaced: false,
     };
-    /// What comes over a bridge.
+    /// Classes of the bridge.
     pub const BRIDGE: Words = Words {
         row: "bridge",
         refused: "bridge_refused",
@@ -52,17 +51,17 @@ impl Words {
     };
 }
 
-/// Where it is said, and how.
+/// Output of a receiver.
 pub(crate) struct Report<'a> {
     json: bool,
     words: Words,
     out: Output<'a>,
     notes: Output<'a>,
-    /// What gateways are called for people.
+    /// Names of gateways in text.
     pub(super) names: Names,
-    /// What the key is called without which nothing is believed, if there is one.
+    /// Name of the key that datagrams are authenticated with.
     key: Option<String>,
-    /// Lines of the account that stand on the terminal.
+    /// Number of lines of counters on the terminal.
     drawn: usize,
 }
 
@@ -78,7 +77,7 @@ impl<'a> Report<'a> {
         Report { json, words, out, notes, names, key, drawn: 0 }
     }
 
-    /// The groups are joined on `interfaces`; what comes will be published in `domain`, if there is one.
+    /// Reports that the groups are joined on `interfaces`, and in which `domain` samples are published.
     pub(crate) fn ready(&mut self, interfaces: &[&str], domain: Option<&Domain>) -> Result<(), End> {
         let key = self.key.as_deref();
         if self.json {
@@ -97,16 +96,16 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// A sample of the sensor that is called so.
+    /// Prints a sample of `sensor`.
     pub(super) fn sample(&mut self, sensor: &str, remote: &Remote<'_>) -> Result<(), End> {
         if self.json {
-            return remote::json(remote, sensor, &mut self.out);
+            return sample_json(remote, sensor, &mut self.out);
         }
-        let hub = self.names.of(remote.datagram.head.hub);
-        self.out.line(|line| remote::text(remote, &hub, sensor, line))
+        let hub = self.names.of(remote.head.hub);
+        self.out.line(|line| sample_text(remote, &hub, sensor, line))
     }
 
-    /// Samples of `topic` of `sensor` were sent before the one with `head` and did not come, or not yet.
+    /// Reports samples that were sent before the one with `head` and have not arrived.
     pub(super) fn missed(&mut self, head: &Head, sensor: &str, topic: Topic, missed: u32) -> Result<(), End> {
         if self.json {
             let (sensor, topic) = (Some(sensor), Some(topic.name()));
@@ -116,7 +115,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.{sensor}/{}: missed {missed}", topic.name()))
     }
 
-    /// The sensor that sent `head` is called so; what was written of it before has its number.
+    /// Reports the name of the sensor that sent `head`, and was printed under its number before.
     pub(super) fn named(&mut self, head: &Head, sensor: &str) -> Result<(), End> {
         let number = head.sensor;
         if self.json {
@@ -127,7 +126,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.#{number} is {hub}.{sensor}"))
     }
 
-    /// The clock of the machine that sent `head` is so much behind this one's.
+    /// Reports by how much the clock of the gateway that sent `head` is behind this machine's.
     pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), End> {
         let behind_ms = behind_ns as f64 / 1e6;
         if self.json {
@@ -141,7 +140,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// A remote sensor is published as `name`; `here`: it is this machine's own.
+    /// Reports that a remote sensor is published as `name`. `here` says whether its gateway is on this machine.
     pub(super) fn published(&mut self, head: &Head, name: &str, here: bool) -> Result<(), End> {
         if self.json {
             return self.out.json(&Notice { sensor: Some(name), here, ..Notice::of("published", head) });
@@ -154,15 +153,19 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "publishing {name}{which}"))
     }
 
-    /// What became of all that came, in shared memory.
-    pub(super) fn publication(&mut self, publication: &Publication) -> Result<(), End> {
+    /// Prints the counters of published samples.
+    pub(super) fn publication(
+        &mut self,
+        publication: &Publication,
+        gateways: &GatewayTable,
+    ) -> Result<(), End> {
         let line = Published::new(publication, self.words.published);
         if self.json {
             self.out.json(&line)?
         } else {
             self.out.line(|out| line.text(out))?
         }
-        for &(hub, no_room) in publication.no_room() {
+        for (hub, no_room) in gateways.no_room() {
             if self.json {
                 self.out.json(&NoRoom { class: self.words.no_room, hub, no_room })?;
             } else {
@@ -173,7 +176,7 @@ impl<'a> Report<'a> {
         Ok(())
     }
 
-    /// Something is wrong here.
+    /// Reports a problem.
     pub(super) fn trouble(&mut self, what: &str) -> Result<(), End> {
         if self.json {
             let notice = Notice::of("trouble", &Head::default());
@@ -182,33 +185,28 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{what}"))
     }
 
-    /// The account as it stands, over the one that was drawn before.
-    pub(super) fn draw(&mut self, stats: &StreamStats, peers: &PeerTable) -> Result<(), End> {
+    /// Draws the counters over the previous ones.
+    pub(super) fn draw(&mut self, gateways: &GatewayTable) -> Result<(), End> {
         if self.drawn > 0 {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
         }
-        self.drawn = stats.rows().count() + 2 + usize::from(stats.given_up().lives > 0);
-        self.text_account(stats, peers, &[])
+        self.drawn = gateways.rows().count() + 2 + usize::from(gateways.evicted().runs > 0);
+        self.text_account(gateways, &[])
     }
 
-    /// The account as it stands, over the one that stands on the terminal, if any does; `others` are more reasons why
-    /// something was refused.
+    /// Prints the counters, over those on the terminal if there are any. `others` are further reasons for which datagrams
+    /// were refused.
     pub(super) fn stats(
         &mut self,
-        stats: &StreamStats,
-        peers: &PeerTable,
+        gateways: &GatewayTable,
         others: &[(&'static str, u64)],
     ) -> Result<(), End> {
         if !self.json {
-            return if self.drawn > 0 {
-                self.draw(stats, peers)
-            } else {
-                self.text_account(stats, peers, others)
-            };
+            return if self.drawn > 0 { self.draw(gateways) } else { self.text_account(gateways, others) };
         }
-        for row in stats.rows() {
-            let sensor = peers.row_name(row.hub, row.epoch, row.sensor);
-            let replaced = peers.replaced(row.hub, row.epoch, row.sensor, row.topic);
+        for row in gateways.rows() {
+            let sensor = gateways.row_name(row);
+            let replaced = gateways.replaced(row);
             self.out.json(&Counted {
                 class: self.words.row,
                 hub: row.hub,
@@ -223,26 +221,21 @@ impl<'a> Report<'a> {
                 replaced: self.words.tells_replaced.then_some(replaced),
             })?;
         }
-        self.out.json(&Sums::new(stats.given_up(), self.words.given_up))?;
-        self.out.json(&Refused { class: self.words.refused, reasons: Reasons { stats, others } })
+        self.out.json(&Sums::new(gateways.evicted(), self.words.given_up))?;
+        self.out.json(&Refused { class: self.words.refused, reasons: Reasons { gateways, others } })
     }
 
-    fn text_account(
-        &mut self,
-        stats: &StreamStats,
-        peers: &PeerTable,
-        others: &[(&'static str, u64)],
-    ) -> Result<(), End> {
+    fn text_account(&mut self, gateways: &GatewayTable, others: &[(&'static str, u64)]) -> Result<(), End> {
         let titles = ["HUB", "EPOCH", "TOPIC", "RECEIVED", "LOST", "DUPLICATE", "REORDERED", "REPLACED"];
         let titles = &titles[..titles.len() - usize::from(!self.words.tells_replaced)];
         let mut rows = vec![titles.iter().map(|title| String::from(*title)).collect()];
-        rows.extend(stats.rows().map(|row| {
-            let replaced = peers.replaced(row.hub, row.epoch, row.sensor, row.topic);
+        rows.extend(gateways.rows().map(|row| {
+            let replaced = gateways.replaced(row);
             let replaced = replaced.map_or_else(|| "-".into(), |count| count.to_string());
             let mut cells = vec![
                 self.names.of(row.hub),
                 row.epoch.to_string(),
-                format!("{}/{}", peers.row_name(row.hub, row.epoch, row.sensor), topic(row)),
+                format!("{}/{}", gateways.row_name(row), topic(row)),
                 row.received.to_string(),
                 row.lost().to_string(),
                 row.duplicate.to_string(),
@@ -252,14 +245,14 @@ impl<'a> Report<'a> {
             cells
         }));
         table(&mut self.out, &rows)?;
-        let given_up = stats.given_up();
-        if given_up.lives > 0 {
+        let given_up = gateways.evicted();
+        if given_up.runs > 0 {
             self.out.line(|line| Sums::new(given_up, self.words.given_up).text(line))?;
         }
         self.out.line(|line| {
             write!(line, "refused:")?;
             let mut any = false;
-            for (reason, count) in (Reasons { stats, others }).all().filter(|(_, count)| *count > 0) {
+            for (reason, count) in (Reasons { gateways, others }).all().filter(|(_, count)| *count > 0) {
                 write!(line, " {reason} {count}")?;
                 any = true;
             }
@@ -268,7 +261,7 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Class `lan` or `bridge` of what comes.
+/// Class `lan` or `bridge` of a receiver.
 #[derive(Serialize)]
 struct Counted<'a> {
     class: &'static str,
@@ -281,10 +274,10 @@ struct Counted<'a> {
     lost: u64,
     duplicate: u64,
     reordered: u64,
-    /// Of datagrams, which may have a MAC.
+    /// Only for datagrams, which may have a MAC.
     #[serde(skip_serializing_if = "Option::is_none")]
     authenticated: Option<bool>,
-    /// Of a bridge: as its sender announced it, if it did.
+    /// Only for a bridge: the count that the sender announced.
     #[serde(skip_serializing_if = "Option::is_none")]
     replaced: Option<Option<u32>>,
 }
@@ -297,15 +290,15 @@ struct Refused<'a> {
     reasons: Reasons<'a>,
 }
 
-/// How much was refused, by the reason.
+/// Refused datagrams by reason.
 struct Reasons<'a> {
-    stats: &'a StreamStats,
+    gateways: &'a GatewayTable,
     others: &'a [(&'static str, u64)],
 }
 
 impl Reasons<'_> {
     fn all(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let known = DatagramError::ALL.into_iter().map(|why| (why.name(), self.stats.refused(why)));
+        let known = DatagramError::ALL.into_iter().map(|why| (why.name(), self.gateways.refused(why)));
         known.chain(self.others.iter().copied())
     }
 }
@@ -320,11 +313,267 @@ impl Serialize for Reasons<'_> {
     }
 }
 
-/// The topic's name; an account has no other ones.
+/// Returns the name of the row's topic.
 fn topic(row: &Row) -> &'static str {
     match Topic::of_number(row.topic) {
         Some(topic) => topic.name(),
         None if row.topic == Announce::NUMBER => "announce",
         None => "unknown",
     }
+}
+
+/// Class `notice`.
+#[derive(Serialize)]
+struct Notice<'a> {
+    class: &'static str,
+    kind: &'static str,
+    sensor: Option<&'a str>,
+    topic: Option<&'static str>,
+    missed: u32,
+    #[serde(serialize_with = "known_id")]
+    hub: Option<u64>,
+    epoch: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    behind_ms: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    message: Option<&'a str>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    here: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    number: Option<u8>,
+}
+
+impl Notice<'_> {
+    /// Creates a notice without details.
+    fn of(kind: &'static str, head: &Head) -> Self {
+        Notice {
+            class: "notice",
+            kind,
+            sensor: None,
+            topic: None,
+            missed: 0,
+            hub: Some(head.hub),
+            epoch: Some(head.epoch),
+            behind_ms: None,
+            message: None,
+            here: false,
+            number: None,
+        }
+    }
+}
+
+/// Class `ready`. Only a receiver that publishes has `domain`, `root` and `pid`.
+#[derive(Serialize)]
+struct Ready<'a> {
+    class: &'static str,
+    port: u16,
+    interfaces: &'a [&'a str],
+    key: Option<&'a str>,
+    #[serde(flatten)]
+    place: Option<Place<'a>>,
+}
+
+#[derive(Serialize)]
+struct Place<'a> {
+    domain: &'a str,
+    root: &'a Path,
+    pid: u32,
+}
+
+impl<'a> Ready<'a> {
+    fn new(interfaces: &'a [&'a str], domain: Option<&'a Domain>, key: Option<&'a str>) -> Ready<'a> {
+        let place = domain.map(|domain| Place {
+            domain: domain.name(),
+            root: domain.root(),
+            pid: std::process::id(),
+        });
+        Ready { class: "ready", port: PORT, interfaces, key, place }
+    }
+}
+
+/// Class `lan_published` or `bridge_published`.
+#[derive(Serialize)]
+struct Published<'a> {
+    class: &'static str,
+    sensors: Vec<&'a str>,
+    unnamed: u64,
+    unannounced: u64,
+    late: u64,
+    capacity: u64,
+    shortage: u64,
+    unproven: u64,
+    no_room: u64,
+    loan_failed: u64,
+}
+
+/// Class `lan_no_room` or `bridge_no_room`: samples of one gateway.
+#[derive(Serialize)]
+struct NoRoom {
+    class: &'static str,
+    #[serde(serialize_with = "id")]
+    hub: u64,
+    no_room: u64,
+}
+
+impl<'a> Published<'a> {
+    fn new(publication: &'a Publication, class: &'static str) -> Published<'a> {
+        let left_out = publication.left_out;
+        Published {
+            class,
+            sensors: publication.names(),
+            unnamed: left_out.unnamed,
+            unannounced: left_out.unannounced,
+            late: left_out.late,
+            capacity: left_out.capacity,
+            shortage: left_out.shortage,
+            unproven: left_out.unproven,
+            no_room: left_out.no_room,
+            loan_failed: publication.failed(),
+        }
+    }
+
+    /// Writes the counters as text.
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        let Published { unnamed, unannounced, late, capacity, shortage, .. } = self;
+        let Published { unproven, no_room, loan_failed, .. } = self;
+        write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
+        write!(line, "{unproven} in a gateway's first second, ")?;
+        write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
+        write!(line, "{no_room} beyond --memory, {shortage} for lack of room, {loan_failed} without memory")
+    }
+}
+
+/// Class `lan_given_up` or `bridge_given_up`.
+#[derive(Serialize)]
+struct Sums {
+    class: &'static str,
+    lives: u64,
+    displaced: u64,
+    received: u64,
+    lost: u64,
+    duplicate: u64,
+    reordered: u64,
+}
+
+impl Sums {
+    fn new(given_up: EvictedTotals, class: &'static str) -> Sums {
+        let EvictedTotals { runs: lives, displaced, received, lost, duplicate, reordered } = given_up;
+        Sums { class, lives, displaced, received, lost, duplicate, reordered }
+    }
+
+    /// Writes the counters as text.
+    fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
+        let Sums { lives, displaced, received, lost, duplicate, reordered, .. } = self;
+        write!(
+            line,
+            "of {lives} former starts of gateways together, {displaced} of them given up for others: "
+        )?;
+        write!(line, "received {received}, lost {lost}, ")?;
+        write!(line, "duplicate {duplicate}, reordered {reordered}")
+    }
+}
+
+fn known_id<S: Serializer>(hub: &Option<u64>, serializer: S) -> Result<S::Ok, S::Error> {
+    match hub {
+        Some(hub) => id(hub, serializer),
+        None => serializer.serialize_none(),
+    }
+}
+
+/// Prints a sample of `sensor` as JSON.
+fn sample_json(remote: &Remote<'_>, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
+    // The flags are written after all other keys.
+    let header = Header { flags: 0, ..remote.header(std::process::id()) };
+    show(remote, SampleLine { remote, sensor, header: &header, out })
+}
+
+/// Writes a sample of `sensor` and its gateway `hub` as text.
+fn sample_text(remote: &Remote<'_>, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
+    write!(line, "{hub}.{sensor}/{} ", remote.topic.name())?;
+    show(remote, ForPeople { header: &remote.header(std::process::id()), line })?;
+    if let Some(age_ms) = age_ms(remote) {
+        write!(line, ", {age_ms:.1} ms old")?;
+    }
+    if remote.late { write!(line, ", late") } else { Ok(()) }
+}
+
+fn age_ms(remote: &Remote<'_>) -> Option<f64> {
+    remote.age_ns.map(|age_ns| (age_ns / 1000) as f64 / 1000.0)
+}
+
+/// Generates `show` from the table of topics.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        /// Shows the payload by `how`, unless there is too little memory to unpack it.
+        fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
+            match remote.topic {
+                $(Topic::$topic => remote
+                    .payload
+                    .unpack::<scanhub_schema::payload_type!($payload)>()
+                    .map_or(Ok(()), |payload| how.show(&*payload)),)*
+            }
+        }
+    };
+}
+
+scanhub_schema::for_each_topic!(payloads);
+
+/// A form in which a payload is printed.
+trait Way<E> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), E>;
+}
+
+struct ForPeople<'a> {
+    header: &'a Header,
+    line: &'a mut Vec<u8>,
+}
+
+impl Way<io::Error> for ForPeople<'_> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> io::Result<()> {
+        payload.text(self.header, self.line)
+    }
+}
+
+struct SampleLine<'a, 'out> {
+    remote: &'a Remote<'a>,
+    sensor: &'a str,
+    header: &'a Header,
+    out: &'a mut Output<'out>,
+}
+
+impl Way<End> for SampleLine<'_, '_> {
+    fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), End> {
+        let (sensor, header) = (self.sensor, self.header);
+        payload.json(sensor, header, self)
+    }
+}
+
+impl Keys for SampleLine<'_, '_> {
+    /// Adds the keys that every class of a remote sample has after its own.
+    fn take(self, keys: impl Serialize) -> Result<(), End> {
+        #[derive(Serialize)]
+        struct WithOrigin<T: Serialize> {
+            #[serde(flatten)]
+            keys: T,
+            #[serde(serialize_with = "id")]
+            hub: u64,
+            epoch: u32,
+            authenticated: bool,
+            age_ms: Option<f64>,
+            #[serde(skip_serializing_if = "std::ops::Not::not")]
+            late: bool,
+            #[serde(flatten)]
+            flags: Option<json::Words>,
+        }
+        let Remote { topic, head: Head { hub, epoch, .. }, late, authenticated, .. } = *self.remote;
+        let has_head = !matches!(topic, Topic::Background | Topic::Status);
+        let flags = has_head.then(|| json::Words::of(&self.remote.header(std::process::id())));
+        let age_ms = age_ms(self.remote);
+        self.out.json(&WithOrigin { keys, hub, epoch, authenticated, age_ms, late, flags })
+    }
+}
+
+/// Serializes a hub's ID as in all output.
+fn id<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&format_args!("{id:016x}"))
 }

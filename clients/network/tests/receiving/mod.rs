@@ -106,9 +106,7 @@ impl Receiving {
                 let made = match &arrived {
                     Arrived::Sample(sample) => self.republisher.sample(sample, || hub.to_owned(), wall),
                     Arrived::Announced(announced) => self.republisher.announced(announced, hub, wall),
-                    Arrived::Refused { .. } | Arrived::Untimely { .. } | Arrived::Part | Arrived::Known => {
-                        Ok(None)
-                    }
+                    _ => Ok(None),
                 };
                 made.expect("memory is not short");
             }

@@ -129,7 +129,8 @@ impl Listener {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
             Arrived::Untimely { .. } => Arrival::Refused(DatagramError::Untimely),
             Arrived::Part => Arrival::Part,
-            Arrived::Known => Arrival::Known,
+            // No hub is selected, and this network has no names.
+            Arrived::Known | Arrived::Ignored | Arrived::Foreign => Arrival::Known,
             Arrived::Announced(_) => Arrival::Announced,
             Arrived::Sample(sample) => Arrival::Sample { late: sample.remote.late },
         };
@@ -141,7 +142,7 @@ impl Listener {
         let made = match &arrived {
             Arrived::Sample(sample) => self.republisher.sample(sample, || GATEWAY.to_owned(), wall),
             Arrived::Announced(announced) => self.republisher.announced(announced, GATEWAY, wall),
-            Arrived::Refused { .. } | Arrived::Untimely { .. } | Arrived::Part | Arrived::Known => Ok(None),
+            _ => Ok(None),
         };
         if let Err(failure) = made {
             shared.log.tell(now, &Event::Acted { text: &format!("a listener says {failure}") });
@@ -150,12 +151,12 @@ impl Listener {
 
     /// It is gone; its account is what it would have told.
     pub(super) fn end(self, shared: &Shared, now: Nanos) {
-        let stats = self.incoming.stats();
+        let stats = self.incoming.gateways();
         for row in stats.rows() {
             shared.log.tell(now, &Event::Counted { row });
         }
         let refused = DatagramError::ALL.iter().map(|&why| stats.refused(why)).sum();
-        let (given_up, sensors) = (stats.given_up().lives, self.republisher.names().len());
+        let (given_up, sensors) = (stats.evicted().runs, self.republisher.names().len());
         shared.log.tell(now, &Event::ListenerEnds { life: self.life, refused, given_up, sensors });
     }
 }

@@ -5,6 +5,7 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
+use scanhub_network::lan::incoming::CheckedPayload;
 use scanhub_network::lan::republish::{SensorTopics, TopicStore};
 use scanhub_schema::{Failure, Header, Topic, Wake};
 
@@ -77,13 +78,13 @@ impl SensorTopics for MemoryTopics {
         *self.next[topic as usize].as_mut().expect("it is there") += count;
     }
 
-    fn send(&mut self, topic: Topic, header: &Header, payload: &[u8]) {
+    fn send(&mut self, topic: Topic, header: &Header, payload: CheckedPayload<'_>) {
         let next = self.next[topic as usize].as_mut().expect("it is there");
         let header = Header { topic_seq: *next, ..*header };
         *next += 1;
         let mut all = self.memory.0.borrow_mut();
         let waiting = all.get_mut(&self.name).expect("it was made");
-        waiting.samples.push_back(Published { topic, header, payload: payload.to_vec() });
+        waiting.samples.push_back(Published { topic, header, payload: payload.bytes.to_vec() });
     }
 
     fn connect(&self, _topic: Topic) {}

@@ -3,7 +3,7 @@
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use crate::lan::StreamStats;
+use crate::lan::GatewayTable;
 use scanhub_schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE};
 use scanhub_schema::{
     Background, BackgroundHead, Early, Family, Flags, Header, Status, Topic, Verdict, Zones,
@@ -305,7 +305,7 @@ fn handed(out: &mut Outgoing) -> Vec<Vec<u8>> {
 
 /// Zones that are received and lost of what comes to somebody who heard nothing before.
 fn heard(datagrams: &[&[u8]]) -> (u64, u64) {
-    let mut stats = StreamStats::new(&Topic::ALL);
+    let mut stats = GatewayTable::new(&Topic::ALL);
     for bytes in datagrams {
         stats.receive(bytes, 1, 0).expect("a datagram");
     }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use fastrand::Rng;
-use scanhub_network::lan::{Fresh, GivenUp, LIVES, ROWS, StreamStats, WINDOW};
+use scanhub_network::lan::{EvictedTotals, Fresh, GatewayTable, MAX_ROWS, MAX_RUNS, WINDOW};
 use scanhub_schema::datagram::{Announce, Announced, DatagramError, HEAD, Head, Packed};
 use scanhub_schema::{Background, Marks, Topic, Zones};
 
@@ -62,7 +62,7 @@ struct Model {
     heard: BTreeMap<u64, (u64, Option<(u64, u64)>)>,
     /// The others, in the order in which they were retired.
     retired: Vec<(u64, u32)>,
-    given_up: GivenUp,
+    given_up: EvictedTotals,
     refused: BTreeMap<&'static str, u64>,
 }
 
@@ -88,7 +88,7 @@ impl Model {
         }
         let is_new = before != Some(epoch);
         let lives = self.living.len() + self.retired.len();
-        let is_full = self.rows.len() == ROWS || is_new && lives == LIVES;
+        let is_full = self.rows.len() == MAX_ROWS || is_new && lives == MAX_RUNS;
         let has_retired = !self.retired.is_empty() || before.is_some_and(|older| older < epoch);
         let can_give_up = has_retired || self.least(hub, delivers, now_ms).is_some();
         if !self.rows.contains_key(&sent.key) && is_full && !can_give_up {
@@ -98,7 +98,7 @@ impl Model {
             self.retired.extend(before.map(|older| (hub, older)));
             self.living.remove(&hub);
             self.heard.remove(&hub);
-            if lives == LIVES {
+            if lives == MAX_RUNS {
                 self.give_up(hub, delivers, now_ms);
             }
             self.living.insert(hub, epoch);
@@ -130,10 +130,10 @@ impl Model {
 
     /// There is a row, or there can be one, after another life was given up if need be.
     fn has_room(&mut self, key: Key, delivers: bool, now_ms: u64) -> bool {
-        if !self.rows.contains_key(&key) && self.rows.len() == ROWS {
+        if !self.rows.contains_key(&key) && self.rows.len() == MAX_ROWS {
             self.give_up(key.0, delivers, now_ms);
         }
-        self.rows.contains_key(&key) || self.rows.len() < ROWS
+        self.rows.contains_key(&key) || self.rows.len() < MAX_ROWS
     }
 
     /// The gateway that makes room for a datagram of `hub`, if nothing is retired.
@@ -164,7 +164,7 @@ impl Model {
             self.retired.remove(0)
         };
         let sum = &mut self.given_up;
-        sum.lives += 1;
+        sum.runs += 1;
         self.rows.retain(|&(hub, epoch, ..), row| {
             if (hub, epoch) != life {
                 return true;
@@ -202,7 +202,7 @@ impl Numbers {
     }
 }
 
-fn figures(account: &StreamStats) -> BTreeMap<Key, [u64; 4]> {
+fn figures(account: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
     let rows = account.rows();
     rows.map(|row| {
         let key = (row.hub, row.epoch, row.sensor, row.topic);
@@ -292,7 +292,7 @@ fn it_says_what_a_model_says_that_keeps_everything() {
     let (mut refused, mut full, mut given_up, mut displaced) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
         let mut world = World::new(seed);
-        let (mut account, mut model) = (StreamStats::new(&Topic::ALL), Model::default());
+        let (mut account, mut model) = (GatewayTable::new(&Topic::ALL), Model::default());
         // All that deliver are busy, or hardly any is.
         let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
@@ -312,10 +312,10 @@ fn it_says_what_a_model_says_that_keeps_everything() {
                 assert_eq!(figures(&account), model.figures(), "seed {seed}, step {step}");
             }
         }
-        full += u32::from(model.rows.len() == ROWS);
-        given_up += model.given_up.lives;
+        full += u32::from(model.rows.len() == MAX_ROWS);
+        given_up += model.given_up.runs;
         displaced += model.given_up.displaced;
-        assert_eq!((figures(&account), account.given_up()), (model.figures(), model.given_up), "seed {seed}");
+        assert_eq!((figures(&account), account.evicted()), (model.figures(), model.given_up), "seed {seed}");
         for refusal in DatagramError::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
             assert_eq!(account.refused(refusal), count, "seed {seed}, {}", refusal.name());
@@ -355,7 +355,7 @@ fn it_is_the_log_of_a_relay() {
             }
         }
         arrivals.sort_by_key(|&(at, _)| at);
-        let mut account = StreamStats::new(&Topic::ALL);
+        let mut account = GatewayTable::new(&Topic::ALL);
         let (mut highest, mut below, mut came) = (0, 0, BTreeSet::new());
         account.receive(&announce(0, first).bytes, 1, 0).unwrap();
         for (_, sent) in &arrivals {

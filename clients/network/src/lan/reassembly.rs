@@ -1,42 +1,41 @@
-//! Samples that come in parts, until they are whole: parts in any order, some twice, some never. However much comes, and from
-//! whomever, the memory for it is bounded. Refuses to know what is in a part, and whether its sample is wanted.
+//! Reassembles samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is bounded, no
+//! matter who sends what.
 
 use scanhub_schema::datagram::{Datagram, Head, PART_LONGEST};
 
-/// The samples that are not whole yet. Those that never will be make room for others, and nobody hears of them again: their
-/// numbers did not arrive.
+/// Samples that are not complete yet. A sample that is evicted for another one is not reported: its number did not arrive.
 #[derive(Default)]
-pub(super) struct Parts {
-    unfinished: Vec<Unfinished>,
-    /// Places whose memory is used again.
-    free: Vec<Unfinished>,
-    /// Parts that came.
+pub(super) struct Reassembler {
+    partial: Vec<PartialSample>,
+    /// Samples whose memory is used again.
+    free: Vec<PartialSample>,
+    /// Parts that arrived.
     count: u64,
 }
 
-/// A sample of which a part came.
-struct Unfinished {
-    /// That of its parts, as of the first one.
+/// A sample with missing parts.
+struct PartialSample {
+    /// Header of its parts, with the index of the first one.
     head: Head,
     from: u64,
-    /// The sample came before.
+    /// Whether the sample is a duplicate.
     is_known: bool,
-    /// The number of its part that came last, among all that came.
+    /// Value of [`Reassembler::count`] at its last part.
     last: u64,
-    /// The length of each part that came.
+    /// Length of each part that arrived.
     lengths: Vec<Option<usize>>,
-    /// The parts, each in a place for the longest.
+    /// The parts, each with room for the longest one.
     bytes: Vec<u8>,
 }
 
-/// Unfinished samples of one sender, sensor and topic.
-const OF_TOPIC: usize = 4;
-/// Unfinished samples of all senders: 23 MB if all of them are as long as one can be.
-const OF_ALL: usize = 64;
+/// Maximum number of partial samples of one sender, sensor and topic.
+const MAX_OF_TOPIC: usize = 4;
+/// Maximum number of partial samples of all senders. They take 23 MB if all are as long as possible.
+const MAX_OF_ALL: usize = 64;
 
-impl Parts {
-    /// Takes a part that came `from` a sender, of a sample that came before if it `is_known`. Once its sample is whole, writes
-    /// that into `whole`, and returns its header.
+impl Reassembler {
+    /// Takes a part that came `from` a sender. `is_known` says whether its sample is a duplicate. Once the sample is complete,
+    /// writes it to `whole`, and returns its header.
     pub(super) fn take(
         &mut self,
         part: &Datagram<'_>,
@@ -46,12 +45,12 @@ impl Parts {
     ) -> Option<Head> {
         self.count += 1;
         let head = Head { part: 0, ..part.head };
-        let known = self.unfinished.iter().position(|it| it.from == from && it.head == head);
+        let known = self.partial.iter().position(|it| it.from == from && it.head == head);
         let at = match known {
             Some(at) => at,
             None => self.begin(head, from, is_known)?,
         };
-        let it = &mut self.unfinished[at];
+        let it = &mut self.partial[at];
         it.last = self.count;
         let number = usize::from(part.head.part);
         let begin = PART_LONGEST * number;
@@ -60,7 +59,7 @@ impl Parts {
         if it.lengths.iter().any(Option::is_none) {
             return None;
         }
-        let it = self.unfinished.swap_remove(at);
+        let it = self.partial.swap_remove(at);
         whole.clear();
         for (bytes, len) in it.bytes.chunks(PART_LONGEST).zip(it.lengths.iter().flatten()) {
             whole.extend_from_slice(&bytes[..*len]);
@@ -69,35 +68,35 @@ impl Parts {
         Some(Head { parts: 1, ..head })
     }
 
-    /// Where the sample is from now on. It takes the place of one that says otherwise of the same number, of the one of its
-    /// topic that waits for longest, or of the one of all; but one that came before never that of one that did not.
+    /// Adds a sample, and returns its index. If there is no room, it replaces a sample with the same number and another header,
+    /// the one of its topic that has waited for longest, or the one of all. A duplicate never replaces a new sample.
     fn begin(&mut self, head: Head, from: u64, is_known: bool) -> Option<usize> {
-        let topic = |it: &Unfinished| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
+        let topic = |it: &PartialSample| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
         let of_topic = (from, head.hub, head.epoch, head.sensor, head.topic);
-        let same = self.unfinished.iter().filter(|it| topic(it) == of_topic);
+        let same = self.partial.iter().filter(|it| topic(it) == of_topic);
         let other =
-            self.unfinished.iter().position(|it| topic(it) == of_topic && it.head.sequence == head.sequence);
-        let is_full = same.count() == OF_TOPIC;
-        let waits = self.unfinished.iter().enumerate();
+            self.partial.iter().position(|it| topic(it) == of_topic && it.head.sequence == head.sequence);
+        let is_full = same.count() == MAX_OF_TOPIC;
+        let waits = self.partial.iter().enumerate();
         let oldest = waits
             .filter(|(_, it)| !is_full || topic(it) == of_topic)
             .min_by_key(|(_, it)| (!it.is_known, it.last));
-        let is_full = is_full || self.unfinished.len() == OF_ALL;
+        let is_full = is_full || self.partial.len() == MAX_OF_ALL;
         if other.is_none() && is_full && is_known && oldest.is_some_and(|(_, it)| !it.is_known) {
             return None;
         }
         if let Some(at) = other.or(oldest.filter(|_| is_full).map(|(at, _)| at)) {
-            self.free.push(self.unfinished.swap_remove(at));
+            self.free.push(self.partial.swap_remove(at));
         }
-        let new = || Unfinished { head, from, is_known, last: 0, lengths: Vec::new(), bytes: Vec::new() };
+        let new = || PartialSample { head, from, is_known, last: 0, lengths: Vec::new(), bytes: Vec::new() };
         let mut it = self.free.pop().unwrap_or_else(new);
         (it.head, it.from, it.is_known) = (head, from, is_known);
         let parts = usize::from(head.parts);
         it.lengths.clear();
         it.lengths.resize(parts, None);
         it.bytes.resize(parts * PART_LONGEST, 0);
-        self.unfinished.push(it);
-        Some(self.unfinished.len() - 1)
+        self.partial.push(it);
+        Some(self.partial.len() - 1)
     }
 }
 
@@ -110,7 +109,7 @@ mod tests {
     }
 
     /// Takes part number `part` of `head`, which says who it is; what is whole then.
-    fn take(parts: &mut Parts, head: Head, part: u8, from: u64) -> Option<Vec<u8>> {
+    fn take(parts: &mut Reassembler, head: Head, part: u8, from: u64) -> Option<Vec<u8>> {
         let (payload, mut whole) = ([head.sequence as u8, part].repeat(usize::from(part) + 1), vec![9]);
         let datagram = Datagram { head: Head { part, ..head }, payload: &payload, mac: None };
         let told = parts.take(&datagram, from, false, &mut whole)?;
@@ -123,19 +122,19 @@ mod tests {
     #[test]
     fn parts_in_any_order_and_some_twice_are_one_sample() {
         for order in [&[0, 1, 2][..], &[2, 1, 0], &[1, 1, 2, 1, 0], &[2, 0, 0, 2, 1]] {
-            let mut parts = Parts::default();
+            let mut parts = Reassembler::default();
             let (last, first) = order.split_last().unwrap();
             for part in first {
                 assert_eq!(take(&mut parts, head(7), *part, 1), None, "{order:?}");
             }
             assert_eq!(take(&mut parts, head(7), *last, 1).as_deref(), Some(&WHOLE[..]), "{order:?}");
-            assert!(parts.unfinished.is_empty());
+            assert!(parts.partial.is_empty());
         }
     }
 
     #[test]
     fn nothing_is_made_of_parts_of_two() {
-        let mut parts = Parts::default();
+        let mut parts = Reassembler::default();
         take(&mut parts, head(7), 0, 1);
         take(&mut parts, head(7), 1, 1);
         for (other, from) in [
@@ -160,13 +159,13 @@ mod tests {
 
     #[test]
     fn four_of_a_topic_wait_and_the_oldest_makes_room() {
-        let mut parts = Parts::default();
+        let mut parts = Reassembler::default();
         for sequence in 0..4 {
             take(&mut parts, head(sequence), 0, 1);
         }
         take(&mut parts, head(0), 1, 1);
         take(&mut parts, head(4), 0, 1);
-        assert_eq!(parts.unfinished.len(), 4);
+        assert_eq!(parts.partial.len(), 4);
         assert!(take(&mut parts, head(0), 2, 1).is_some(), "it did not wait for longest");
         take(&mut parts, head(1), 1, 1);
         assert_eq!(take(&mut parts, head(1), 2, 1), None, "its first part is gone");
@@ -174,13 +173,13 @@ mod tests {
 
     #[test]
     fn memory_is_bounded_whoever_sends() {
-        let mut parts = Parts::default();
+        let mut parts = Reassembler::default();
         for hub in 0..1000 {
             for sequence in 0..6 {
                 assert_eq!(take(&mut parts, Head { hub, parts: 255, ..head(sequence) }, 0, hub), None);
             }
         }
-        let places = parts.unfinished.iter().chain(&parts.free);
+        let places = parts.partial.iter().chain(&parts.free);
         let bytes: usize = places.clone().map(|it| it.bytes.capacity()).sum();
         assert!(places.count() <= 65 && bytes <= 65 * 255 * PART_LONGEST, "{bytes}");
         take(&mut parts, head(7), 0, 1);

@@ -1,0 +1,1112 @@
+//! The table of gateways: everything that a receiver keeps about the gateways that send to it, and what it counts.
+//!
+//! Each start of a gateway is a run with its own epoch. The run with the highest epoch is active, and lower ones are
+//! retired. Memory is bounded by the number of runs and of their sensors and topics, no matter who sends. There is one
+//! rule for the run that makes room for another one: the run that retired first is evicted. If no run is retired, active
+//! runs are compared by their [`Standing`].
+//!
+//! Anyone who can send can invent gateways. A run that is known to deliver is therefore never evicted for one that only
+//! announces itself, and the run that has been silent for longest goes first. Time is an argument, and MACs are checked
+//! in `incoming`.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap};
+
+use scanhub_schema::Topic;
+use scanhub_schema::datagram::{Announce, Datagram, DatagramError, Head};
+
+use super::senders::{DuplicateDetector, SILENCE_NS, SenderMatch, Senders};
+use super::sequence::{Fresh, Row};
+
+/// Maximum number of runs of gateways that are distinguished.
+pub const MAX_RUNS: usize = 64;
+/// Maximum number of sensors and topics, of all runs together, that are counted separately.
+pub const MAX_ROWS: usize = 1024;
+/// Maximum number of gateways with a key whose epochs are kept. A recording of a forgotten one is refused by its time.
+pub const MAX_EPOCHS: usize = 1024;
+
+/// Gateways that a receiver distinguishes: their runs, sensors, senders, clocks and counters.
+///
+/// The counters of a topic start with its first datagram, or with an announcement that arrives before it. Samples that
+/// were sent earlier are not counted. An announcement that arrives after the first datagram therefore says nothing about
+/// earlier ones, and a late datagram from before the start moves the start back.
+///
+/// The counters of an evicted run are added to [`evicted`](GatewayTable::evicted). Rows and evicted totals together
+/// therefore always count everything that was accepted.
+///
+/// Two gateways with the same number and epoch are distinguished by their senders and announcements, and only the first
+/// one is accepted. After 3 s of its silence, another sender is accepted as a new run, but not if two gateways are known
+/// to send.
+pub struct GatewayTable {
+    /// Bit n is set if the receiver has joined the group of topic number n.
+    followed: u64,
+    /// Whether the receiver has a key, so that only samples of announced topics are accepted.
+    is_keyed: bool,
+    /// By number.
+    gateways: BTreeMap<u64, Gateway>,
+    run_count: usize,
+    row_count: usize,
+    epoch_count: usize,
+    is_epoch_new: bool,
+    /// Number of the next event that has an order.
+    next_order: u64,
+    /// Gateways whose clocks were reported to differ.
+    reported_clocks: usize,
+    evicted: EvictedTotals,
+    refused: [u64; DatagramError::ALL.len()],
+}
+
+/// State of one gateway.
+#[derive(Default)]
+struct Gateway {
+    /// By epoch: the last one is active.
+    runs: BTreeMap<u32, Run>,
+    kept_epoch: Option<KeptEpoch>,
+    duplicates: DuplicateDetector,
+    is_clock_reported: bool,
+    /// Samples that did not fit into the memory that remote sensors may use.
+    no_room: u64,
+}
+
+/// Highest epoch of a gateway that had the key. It outlives the runs and the receiver.
+struct KeptEpoch {
+    epoch: u32,
+    order: u64,
+}
+
+/// State of one run of a gateway.
+struct Run {
+    /// Time at which the run was accepted.
+    since_ns: u64,
+    /// Order in which active runs were accepted, or retired ones retired.
+    order: u64,
+    standing: Standing,
+    senders: Senders,
+    delays: Delays,
+    /// By the sensor's number.
+    sensors: BTreeMap<u8, Sensor>,
+}
+
+/// State of one sensor in one run of its gateway.
+#[derive(Default)]
+struct Sensor {
+    announced: Option<Announce>,
+    /// Whether it was announced under another name before, because the hub restarted with its sensors in another order.
+    is_renamed: bool,
+    /// Whether it was printed under its number.
+    is_numbered: bool,
+    /// By the topic's number.
+    rows: BTreeMap<u8, Row>,
+}
+
+/// Gateway and epoch of a run.
+type RunId = (u64, u32);
+
+/// Totals of the runs that were evicted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct EvictedTotals {
+    /// Runs of gateways.
+    pub runs: u64,
+    /// Runs that were still active and had to make room for others.
+    pub displaced: u64,
+    /// Distinct sequence numbers that arrived.
+    pub received: u64,
+    /// Sequence numbers that did not arrive, and cannot arrive any more because their run has ended.
+    pub lost: u64,
+    /// Sequence numbers that arrived again.
+    pub duplicate: u64,
+    /// Sequence numbers among `received` that arrived after a higher one.
+    pub reordered: u64,
+}
+
+/// What the table knows about a datagram that it accepted.
+pub(super) struct Accepted {
+    pub(super) fresh: Fresh,
+    /// Whether a run of the gateway begins with it.
+    pub(super) begins: bool,
+    /// Samples that were sent since the one before it and have not arrived.
+    pub(super) missed: u32,
+    /// Bytes of memory that the payload fills.
+    pub(super) room: usize,
+    /// The announcement, if it is one.
+    pub(super) announce: Option<Announce>,
+}
+
+impl GatewayTable {
+    /// Creates a table for a receiver that has joined the groups of `topics`. Announcements of other topics are ignored,
+    /// because their samples would count as lost.
+    pub fn new(topics: &[Topic]) -> GatewayTable {
+        GatewayTable {
+            followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
+            is_keyed: false,
+            gateways: BTreeMap::new(),
+            run_count: 0,
+            row_count: 0,
+            epoch_count: 0,
+            is_epoch_new: false,
+            next_order: 0,
+            reported_clocks: 0,
+            evicted: EvictedTotals::default(),
+            refused: [0; DatagramError::ALL.len()],
+        }
+    }
+
+    /// Returns the table of a receiver with a key. It accepts samples only from announced sensors and topics, starting
+    /// with the number in the first announcement, and no run before those in `epochs`. It does not accept another sender
+    /// as the next run of a silent gateway. Recorded datagrams therefore cannot be replayed.
+    pub(super) fn keyed(mut self, epochs: HashMap<u64, u32>) -> GatewayTable {
+        self.is_keyed = true;
+        let mut epochs: Vec<_> = epochs.into_iter().collect();
+        epochs.sort_unstable_by_key(|&(hub, epoch)| Reverse((epoch, hub)));
+        epochs.truncate(MAX_EPOCHS);
+        epochs.iter().rev().for_each(|&(hub, epoch)| self.keep_epoch(hub, epoch));
+        self.is_epoch_new = false;
+        self
+    }
+
+    /// Checks and counts `bytes`, a datagram with a whole sample, without a key. `from` identifies the sender, for
+    /// example its address and port. `now_ns` is the time of any clock that is never set. A datagram that is accepted
+    /// can be unpacked.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason for which the datagram is refused. The reason is counted, and nothing else changes.
+    pub fn receive<'a>(
+        &mut self,
+        bytes: &'a [u8],
+        from: u64,
+        now_ns: u64,
+    ) -> Result<(Datagram<'a>, Fresh), DatagramError> {
+        let read = Datagram::read(bytes);
+        let taken =
+            read.and_then(|datagram| Ok((datagram, self.take(&datagram, from, false, now_ns)?.fresh)));
+        taken.inspect_err(|why| self.refuse(*why))
+    }
+
+    /// Counts a datagram that is refused for this reason.
+    pub(super) fn refuse(&mut self, why: DatagramError) {
+        self.refused[why as usize] += 1;
+    }
+
+    /// Returns how many datagrams were refused for this reason.
+    pub fn refused(&self, why: DatagramError) -> u64 {
+        self.refused[why as usize]
+    }
+
+    /// Returns the totals of everything that was evicted.
+    pub fn evicted(&self) -> EvictedTotals {
+        self.evicted
+    }
+
+    /// Returns the counters of every sensor and topic that has sent samples, by gateway, epoch, sensor and topic.
+    pub fn rows(&self) -> impl Iterator<Item = &Row> {
+        let runs = self.gateways.values().flat_map(|gateway| gateway.runs.values());
+        runs.flat_map(Run::rows).filter(|row| row.received + row.lost() > 0)
+    }
+
+    /// Checks a complete sample, and records it if it is accepted. A sample that was reassembled from parts has the
+    /// header of one of them.
+    ///
+    /// If `may_move`, the sender of an announcement may be the new address of its gateway, although it also announces
+    /// another run of its hub. This requires that the previous address is silent, and that the announcement's number is
+    /// ahead of all others of its sensor. Set it only for announcements that are authenticated and were sent just now.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason for which the datagram is refused. It is not counted yet.
+    pub(super) fn take(
+        &mut self,
+        datagram: &Datagram<'_>,
+        from: u64,
+        may_move: bool,
+        now_ns: u64,
+    ) -> Result<Accepted, DatagramError> {
+        let (head, run_id) = (&datagram.head, (datagram.head.hub, datagram.head.epoch));
+        // The only check of the payload: everything that follows uses its result.
+        let announce = datagram.announce();
+        let boot = announce.map(|announce| announce.boot);
+        let known = self.find(run_id)?;
+        let room = if announce.is_some() { Ok(0) } else { datagram.check_payload() };
+        let mut sender = known.map_or(SenderMatch::Own, |run| run.senders.judge(from, boot, now_ns));
+        let is_ahead = || known.and_then(|run| run.row(head)).is_some_and(|row| row.is_ahead(head.sequence));
+        let moved_to = boot.filter(|_| sender == SenderMatch::Next && may_move && is_ahead());
+        let is_known = known.is_some();
+        let is_twin = sender == SenderMatch::Twin || sender == SenderMatch::Next && self.is_keyed;
+        if let Some(run) = self.run_mut(run_id) {
+            if let Some(boot) = moved_to {
+                run.senders.move_to(from, boot, now_ns);
+                sender = SenderMatch::Own;
+            } else if is_twin {
+                if room.is_ok() {
+                    run.senders.note(from, boot, now_ns);
+                }
+                return Err(DatagramError::Twin);
+            }
+        }
+        let is_known = is_known && sender == SenderMatch::Own;
+        let arrival = Arrival { delivers: head.topic != Announce::NUMBER, now_ns };
+        match self.run(run_id).and_then(|run| run.row(head)) {
+            // The whole run of the silent gateway makes room.
+            _ if sender == SenderMatch::Next => {}
+            Some(row) if row.is_stale(head.sequence) => return Err(DatagramError::Stale),
+            Some(row) if self.is_keyed && row.is_before(head.sequence) => return Err(DatagramError::Stale),
+            None if self.is_keyed && arrival.delivers => return Err(DatagramError::Untimely),
+            None if !self.has_room(run_id, is_known, arrival) => return Err(DatagramError::Capacity),
+            _ => {}
+        }
+        let room = room?;
+        if sender == SenderMatch::Next {
+            self.end(run_id, false);
+        }
+        if !is_known {
+            self.begin(run_id, arrival);
+        }
+        if self.is_keyed {
+            self.keep_epoch(head.hub, head.epoch);
+        }
+        if let Some(run) = self.run_mut(run_id) {
+            run.standing.take(arrival);
+            run.senders.note(from, boot, now_ns);
+        }
+        let row = self.row(head, head.topic, head.sequence, arrival);
+        let (missed, fresh) =
+            row.map_or((0, Fresh::New), |row| (row.missed_before(head.sequence), row.take(head.sequence)));
+        if let Some(gateway) = self.gateways.get_mut(&head.hub).filter(|_| fresh != Fresh::Duplicate) {
+            gateway.duplicates.accepted();
+        }
+        if let Some(announce) = &announce {
+            self.announce_numbers(head, announce, arrival);
+        }
+        Ok(Accepted { fresh, begins: !is_known, missed, room, announce })
+    }
+
+    /// Records the next sequence numbers of an announcement. A topic that finds no room starts with its first datagram,
+    /// if there is room then.
+    fn announce_numbers(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
+        let followed = self.followed;
+        let is_followed = |number: u8| number < 64 && followed >> number & 1 == 1;
+        for announced in announce.topics().iter().filter(|announced| is_followed(announced.topic)) {
+            if let Some(row) = self.row(head, announced.topic, announced.next, arrival) {
+                row.announce(announced.next);
+            }
+        }
+    }
+
+    /// Checks a part of a sample before memory is spent on it. The sample is checked and counted when it is complete.
+    /// Returns whether the sample is a duplicate. Without a key, every part is accepted.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`DatagramError::Epoch`], [`DatagramError::Stale`] or [`DatagramError::Untimely`] if the whole sample
+    /// would be refused for this reason.
+    pub(super) fn check_part(&self, head: &Head) -> Result<bool, DatagramError> {
+        if !self.is_keyed {
+            return Ok(false);
+        }
+        let run = self.find((head.hub, head.epoch))?;
+        let row = run.and_then(|run| run.row(head)).ok_or(DatagramError::Untimely)?;
+        if row.is_stale(head.sequence) || row.is_before(head.sequence) {
+            return Err(DatagramError::Stale);
+        }
+        Ok(row.came(head.sequence))
+    }
+
+    /// Returns whether this sensor was announced in this run of its gateway, and neither has been evicted since.
+    pub(super) fn is_announced(&self, head: &Head) -> bool {
+        let sensor = self.sensor(head.hub, head.epoch, head.sensor);
+        sensor.is_some_and(|sensor| sensor.rows.contains_key(&Announce::NUMBER))
+    }
+
+    /// Returns the time at which the first datagram of this run of `hub` was accepted, unless the run has been evicted.
+    /// If the time of a run changes, it is another gateway, or the run was evicted in between.
+    pub fn since_ns(&self, hub: u64, epoch: u32) -> Option<u64> {
+        Some(self.run((hub, epoch))?.since_ns)
+    }
+
+    /// Returns whether this run of `hub` is active and known to deliver: its accepted samples cover a second or more.
+    pub fn is_proven(&self, hub: u64, epoch: u32) -> bool {
+        self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.standing.is_proven()))
+    }
+
+    /// Returns whether two gateways are known to send under this number and epoch. All datagrams of one of them are
+    /// refused as [`DatagramError::Twin`].
+    pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
+        self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.senders.is_shared()))
+    }
+
+    /// Returns whether two gateways have the number of `head`, which was refused because of its epoch or sender.
+    pub(super) fn is_duplicate(&mut self, head: &Head, now_ns: u64) -> bool {
+        let is_shared = self.is_shared(head.hub, head.epoch);
+        let gateway = self.gateways.get_mut(&head.hub);
+        is_shared || gateway.is_some_and(|gateway| gateway.duplicates.refused(now_ns))
+    }
+
+    /// Records an announcement that was accepted and is newer than all others of its sensor. Returns by how much this
+    /// machine's clock is ahead of the gateway's, in ns, if they differ and it was not reported yet, and whether the sensor
+    /// was printed under its number before.
+    pub(super) fn announce(&mut self, head: &Head, announce: &Announce, wall_ns: u64) -> (Option<i64>, bool) {
+        let Some(gateway) = self.gateways.get_mut(&head.hub) else { return (None, false) };
+        let Some(run) = gateway.runs.get_mut(&head.epoch) else { return (None, false) };
+        let sensor = run.sensors.entry(head.sensor).or_default();
+        let before = sensor.announced.replace(*announce);
+        sensor.is_renamed |= before.is_some_and(|before| before.sensor() != announce.sensor());
+        let is_named = std::mem::take(&mut sensor.is_numbered);
+        run.delays.add(wall_ns.wrapping_sub(head.stamp_ns) as i64);
+        let ahead_ns = run.delays.difference_ns().filter(|_| !run.delays.clocks_agree());
+        // Anyone who can send can invent more gateways.
+        let is_new = !gateway.is_clock_reported && self.reported_clocks < MAX_RUNS;
+        if ahead_ns.is_some() && is_new {
+            gateway.is_clock_reported = true;
+            self.reported_clocks += 1;
+        }
+        (ahead_ns.filter(|_| is_new), is_named)
+    }
+
+    /// Returns the age of a sample that arrived at `wall_ns`, in ns. `None` while the difference of the clocks is unknown,
+    /// and if they differ too much.
+    pub(super) fn age_ns(&self, head: &Head, wall_ns: u64) -> Option<u64> {
+        self.run((head.hub, head.epoch)).filter(|run| run.delays.clocks_agree())?;
+        wall_ns.checked_sub(head.stamp_ns)
+    }
+
+    /// Returns the last announcement of a sensor.
+    pub fn announced(&self, hub: u64, epoch: u32, sensor: u8) -> Option<&Announce> {
+        self.sensor(hub, epoch, sensor)?.announced.as_ref()
+    }
+
+    /// Returns the sensor's name, or `#` and its number while it is not announced.
+    pub fn name(&self, hub: u64, epoch: u32, sensor: u8) -> String {
+        let announced = self.announced(hub, epoch, sensor);
+        announced.map_or_else(|| format!("#{sensor}"), |announced| announced.sensor().to_owned())
+    }
+
+    /// Returns the name of the sensor that sent `head`, which is printed now, as [`name`](Self::name) does.
+    pub(super) fn printed_name(&mut self, head: &Head) -> String {
+        if let Some(run) = self.run_mut((head.hub, head.epoch)) {
+            let sensor = run.sensors.entry(head.sensor).or_default();
+            sensor.is_numbered |= sensor.announced.is_none();
+        }
+        self.name(head.hub, head.epoch, head.sensor)
+    }
+
+    /// Returns the name of the sensor of a row, as [`name`](Self::name) does, but `#` and its number if it had several
+    /// names, because the row counts the samples of each of them.
+    pub fn row_name(&self, row: &Row) -> String {
+        match self.sensor(row.hub, row.epoch, row.sensor) {
+            Some(sensor) if sensor.is_renamed => format!("#{}", row.sensor),
+            _ => self.name(row.hub, row.epoch, row.sensor),
+        }
+    }
+
+    /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as last announced.
+    /// `None` if that was not announced.
+    pub fn replaced(&self, row: &Row) -> Option<u32> {
+        self.announced(row.hub, row.epoch, row.sensor)?.replaced(row.topic)
+    }
+
+    /// Counts a sample of `hub` that did not fit into the memory that remote sensors may use.
+    pub(super) fn count_no_room(&mut self, hub: u64) {
+        if let Some(gateway) = self.gateways.get_mut(&hub) {
+            gateway.no_room += 1;
+        }
+    }
+
+    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and their number.
+    pub fn no_room(&self) -> impl Iterator<Item = (u64, u64)> {
+        let all = self.gateways.iter().map(|(hub, gateway)| (*hub, gateway.no_room));
+        all.filter(|(_, no_room)| *no_room > 0)
+    }
+
+    /// Returns the highest authenticated epoch of `hub`, if it is kept.
+    pub(super) fn kept_epoch(&self, hub: u64) -> Option<u32> {
+        Some(self.gateways.get(&hub)?.kept_epoch.as_ref()?.epoch)
+    }
+
+    /// Returns the highest authenticated epochs of all gateways if one of them is new since the last call.
+    pub(super) fn take_epochs(&mut self) -> Option<HashMap<u64, u32>> {
+        let kept = |(hub, gateway): (&u64, &Gateway)| Some((*hub, gateway.kept_epoch.as_ref()?.epoch));
+        std::mem::take(&mut self.is_epoch_new).then(|| self.gateways.iter().filter_map(kept).collect())
+    }
+
+    /// Keeps an authenticated epoch of `hub`. Whoever has the key may invent gateways: if there are too many, the one that
+    /// has been known for longest is forgotten.
+    fn keep_epoch(&mut self, hub: u64, epoch: u32) {
+        let order = self.order();
+        let gateway = self.gateways.entry(hub).or_default();
+        if let Some(kept) = &mut gateway.kept_epoch {
+            self.is_epoch_new |= epoch > kept.epoch;
+            kept.epoch = epoch.max(kept.epoch);
+            return;
+        }
+        gateway.kept_epoch = Some(KeptEpoch { epoch, order });
+        self.is_epoch_new = true;
+        self.epoch_count += 1;
+        if self.epoch_count > MAX_EPOCHS {
+            let order = |gateway: &Gateway| gateway.kept_epoch.as_ref().map(|kept| kept.order);
+            let kept = self.gateways.iter().filter_map(|(hub, gateway)| Some((order(gateway)?, *hub)));
+            if let Some((_, first)) = kept.min() {
+                self.gateways.entry(first).and_modify(|gateway| gateway.kept_epoch = None);
+                self.epoch_count -= 1;
+                self.drop_if_unused(first);
+            }
+        }
+    }
+
+    /// Returns the active run with this number and epoch; `None` if it is not known yet.
+    fn find(&self, (hub, epoch): RunId) -> Result<Option<&Run>, DatagramError> {
+        match self.gateways.get(&hub).and_then(|gateway| gateway.runs.last_key_value()) {
+            Some((active, _)) if *active > epoch => Err(DatagramError::Epoch),
+            Some((active, run)) if *active == epoch => Ok(Some(run)),
+            _ => Ok(None),
+        }
+    }
+
+    fn run(&self, (hub, epoch): RunId) -> Option<&Run> {
+        self.gateways.get(&hub)?.runs.get(&epoch)
+    }
+
+    fn run_mut(&mut self, (hub, epoch): RunId) -> Option<&mut Run> {
+        self.gateways.get_mut(&hub)?.runs.get_mut(&epoch)
+    }
+
+    fn sensor(&self, hub: u64, epoch: u32, sensor: u8) -> Option<&Sensor> {
+        self.run((hub, epoch))?.sensors.get(&sensor)
+    }
+
+    /// Returns the row of the sensor that sent `head` for `topic`, or a new row that starts with `first`. `None` if there is
+    /// no room.
+    fn row(&mut self, head: &Head, topic: u8, first: u32, arrival: Arrival) -> Option<&mut Row> {
+        let Head { hub, epoch, sensor, .. } = *head;
+        let known = self.sensor(hub, epoch, sensor);
+        if known.is_none_or(|sensor| !sensor.rows.contains_key(&topic)) {
+            // Each run has at least one row.
+            if self.row_count == MAX_ROWS {
+                self.evict((hub, epoch), arrival)?;
+            }
+            self.row_count += 1;
+        }
+        let sensors = &mut self.run_mut((hub, epoch))?.sensors;
+        let rows = &mut sensors.entry(sensor).or_default().rows;
+        Some(rows.entry(topic).or_insert_with(|| Row::new((hub, epoch, sensor, topic), first)))
+    }
+
+    /// Returns whether there is room for another row of `run_id`, or a run that can be evicted for `arrival`.
+    fn has_room(&self, run_id: RunId, is_known: bool, arrival: Arrival) -> bool {
+        let (hub, epoch) = run_id;
+        let is_full = self.row_count == MAX_ROWS || !is_known && self.run_count == MAX_RUNS;
+        let retires_another = || self.gateways.get(&hub).is_some_and(|gateway| gateway.has_before(epoch));
+        !is_full || retires_another() || self.next_evicted(run_id, arrival).is_some()
+    }
+
+    /// Begins a run, and retires the active run of its gateway. If there are too many runs, evicts one of them, and
+    /// returns it. The caller has checked that there is room.
+    fn begin(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
+        let (hub, epoch) = run_id;
+        let order = self.order();
+        let runs = &mut self.gateways.entry(hub).or_default().runs;
+        if let Some(mut retired) = runs.last_entry() {
+            retired.get_mut().order = order;
+        }
+        runs.insert(epoch, Run::new(arrival.now_ns, order));
+        self.run_count += 1;
+        if self.run_count > MAX_RUNS { self.evict(run_id, arrival) } else { None }
+    }
+
+    /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns it. Returns `None` if all other runs
+    /// are active and known to deliver, or if they have just delivered and `arrival` is not a sample.
+    fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
+        let (evicted, is_displaced) = self.next_evicted(run_id, arrival)?;
+        self.end(evicted, is_displaced);
+        self.drop_if_unused(evicted.0);
+        Some(evicted)
+    }
+
+    /// Returns the run that is evicted next to make room for `run_id`, and whether it is still active.
+    fn next_evicted(&self, run_id: RunId, arrival: Arrival) -> Option<(RunId, bool)> {
+        let all = self.gateways.iter().flat_map(|(hub, gateway)| {
+            let active = gateway.runs.last_key_value().map(|(epoch, _)| *epoch);
+            gateway.runs.iter().map(move |(epoch, run)| ((*hub, *epoch), Some(*epoch) == active, run))
+        });
+        let rank = |is_active, run: &Run| {
+            (is_active, if is_active { run.standing.worth_ns() } else { 0 }, run.order)
+        };
+        let may_go =
+            all.filter(|&(id, is_active, run)| id != run_id && (!is_active || run.standing.may_go(arrival)));
+        let first = may_go.min_by_key(|&(_, is_active, run)| rank(is_active, run));
+        first.map(|(id, is_active, _)| (id, is_active))
+    }
+
+    /// Removes a run, and adds its counters to the totals.
+    fn end(&mut self, (hub, epoch): RunId, is_displaced: bool) {
+        let Some(run) = self.gateways.get_mut(&hub).and_then(|gateway| gateway.runs.remove(&epoch)) else {
+            return;
+        };
+        let sum = &mut self.evicted;
+        sum.runs += 1;
+        sum.displaced += u64::from(is_displaced);
+        for row in run.rows() {
+            sum.received += row.received;
+            sum.lost += row.lost();
+            sum.duplicate += row.duplicate;
+            sum.reordered += row.reordered;
+        }
+        self.run_count -= 1;
+        self.row_count -= run.rows().count();
+    }
+
+    fn drop_if_unused(&mut self, hub: u64) {
+        let is_unused = |gateway: &Gateway| gateway.runs.is_empty() && gateway.kept_epoch.is_none();
+        if self.gateways.get(&hub).is_some_and(is_unused) {
+            self.gateways.remove(&hub);
+        }
+    }
+
+    fn order(&mut self) -> u64 {
+        self.next_order += 1;
+        self.next_order
+    }
+}
+
+impl Gateway {
+    /// Returns whether its active run has a lower epoch.
+    fn has_before(&self, epoch: u32) -> bool {
+        self.runs.last_key_value().is_some_and(|(active, _)| *active < epoch)
+    }
+}
+
+impl Run {
+    fn new(since_ns: u64, order: u64) -> Run {
+        let (standing, senders, delays) = (Standing::NONE, Senders::NONE, Delays::default());
+        Run { since_ns, order, standing, senders, delays, sensors: BTreeMap::new() }
+    }
+
+    fn rows(&self) -> impl Iterator<Item = &Row> {
+        self.sensors.values().flat_map(|sensor| sensor.rows.values())
+    }
+
+    /// Returns the row of the sensor and topic of `head`.
+    fn row(&self, head: &Head) -> Option<&Row> {
+        self.sensors.get(&head.sensor)?.rows.get(&head.topic)
+    }
+}
+
+/// Kind and time of a received datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Arrival {
+    /// Whether it is a sample rather than an announcement.
+    pub delivers: bool,
+    /// Time of arrival, in ns of a clock that is never set.
+    pub now_ns: u64,
+}
+
+/// Rank of a run when there is no room for another one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Standing {
+    heard_ns: u64,
+    /// Times of the first and the last sample.
+    delivered_ns: Option<(u64, u64)>,
+}
+
+/// Minimum time between the first and the last sample of a run that is known to deliver.
+const PROVEN_NS: u64 = 1_000_000_000;
+/// Time after its last sample for which a run that is known to deliver keeps its rank.
+const KEPT_NS: u64 = 60_000_000_000;
+
+impl Standing {
+    /// Rank of a run from which nothing was accepted.
+    pub const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
+
+    /// Records that a datagram was accepted.
+    pub fn take(&mut self, arrival: Arrival) {
+        let now_ns = arrival.now_ns;
+        self.heard_ns = now_ns;
+        if arrival.delivers {
+            self.delivered_ns = Some((self.delivered_ns.map_or(now_ns, |(first_ns, _)| first_ns), now_ns));
+        }
+    }
+
+    /// Returns whether the run may be evicted for a run that `arrival` belongs to. It may if it has not delivered for 3
+    /// s. For a sample, it also may if it has delivered for less than a second.
+    pub fn may_go(&self, arrival: Arrival) -> bool {
+        let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
+        let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENCE_NS);
+        !is_busy || arrival.delivers && !self.is_proven()
+    }
+
+    /// Returns the time until which the run counts as active. Of the runs that may be evicted, the one with the lowest
+    /// value is evicted first.
+    pub fn worth_ns(&self) -> u64 {
+        match self.delivered_ns {
+            None => self.heard_ns,
+            Some((_, last_ns)) => last_ns + if self.is_proven() { KEPT_NS } else { SILENCE_NS },
+        }
+    }
+
+    /// Returns whether the run is known to deliver: a second or more passed between its first and its last sample.
+    pub fn is_proven(&self) -> bool {
+        self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= PROVEN_NS)
+    }
+}
+
+/// Delays of the last announcements of a run. An announcement is stamped when it is sent, so its delay is the transit time
+/// plus the difference of the clocks. The shortest one is the least disturbed.
+#[derive(Default)]
+struct Delays {
+    last_ns: [i64; DELAYS],
+    count: usize,
+}
+
+/// Number of announcements that count: those of two sensors in the last five seconds.
+const DELAYS: usize = 10;
+/// Maximum difference of clocks that are treated as one. An age is at least the time of a telegram on its line, which is
+/// 15 ms or more.
+const CLOCKS_AGREE_NS: u64 = 20_000_000;
+
+impl Delays {
+    fn add(&mut self, delay_ns: i64) {
+        self.last_ns[self.count % DELAYS] = delay_ns;
+        self.count += 1;
+    }
+
+    /// Returns by how much this machine's clock is ahead of the gateway's, plus the shortest transit time, in ns. `None`
+    /// before the first announcement.
+    fn difference_ns(&self) -> Option<i64> {
+        self.last_ns[..self.count.min(DELAYS)].iter().min().copied()
+    }
+
+    fn clocks_agree(&self) -> bool {
+        self.difference_ns().is_some_and(|difference_ns| difference_ns.unsigned_abs() <= CLOCKS_AGREE_NS)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use scanhub_schema::Zones;
+    use scanhub_schema::datagram::{Announced, HEAD, Packed};
+
+    use super::*;
+
+    fn zones(head: Head) -> Vec<u8> {
+        let mut buffer = [0; 100];
+        let len = Zones::unknown().pack(&mut buffer[HEAD..]).unwrap();
+        head.seal(&mut buffer, len).unwrap().to_vec()
+    }
+
+    fn head(hub: u64, epoch: u32, sequence: u32) -> Head {
+        Head { topic: Topic::Zones.number(), revision: 1, hub, epoch, sequence, ..Head::default() }
+    }
+
+    fn announce(hub: u64, next: u32) -> Vec<u8> {
+        let mut announce = Announce::new(1, "front", "");
+        for topic in [Topic::Zones, Topic::Telegram] {
+            announce.add(Announced { topic: topic.number(), group: 81, port: 22_200, next });
+        }
+        let mut buffer = [0; 200];
+        let len = announce.pack(&mut buffer[HEAD..]).unwrap();
+        Head { topic: 0, ..head(hub, 1, 0) }.seal(&mut buffer, len).unwrap().to_vec()
+    }
+
+    fn fresh(table: &mut GatewayTable, bytes: &[u8]) -> Result<Fresh, DatagramError> {
+        at(table, bytes, 0)
+    }
+
+    fn at(table: &mut GatewayTable, bytes: &[u8], now_ms: u64) -> Result<Fresh, DatagramError> {
+        table.receive(bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh)
+    }
+
+    fn knows(table: &GatewayTable, hub: u64, epoch: u32) -> bool {
+        table.since_ns(hub, epoch).is_some()
+    }
+
+    /// 64 gateways that are known to deliver.
+    fn full() -> GatewayTable {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for (number, now_ms) in [(0, 0), (1, 1000)] {
+            for hub in 0..64 {
+                assert_eq!(at(&mut table, &zones(head(hub, 1, number)), now_ms), Ok(Fresh::New));
+            }
+        }
+        table
+    }
+
+    const MS: u64 = 1_000_000;
+
+    fn announces(at_ms: u64) -> Arrival {
+        Arrival { delivers: false, now_ns: at_ms * MS }
+    }
+
+    fn delivers(at_ms: u64) -> Arrival {
+        Arrival { delivers: true, now_ns: at_ms * MS }
+    }
+
+    /// Accepts a datagram of a known or unknown run. Returns the run that was evicted for it.
+    fn hear(table: &mut GatewayTable, run: RunId, arrival: Arrival) -> Option<RunId> {
+        let evicted = match table.find(run) {
+            Ok(Some(_)) => None,
+            _ => table.begin(run, arrival),
+        };
+        table.run_mut(run).unwrap().standing.take(arrival);
+        evicted
+    }
+
+    fn is_over(table: &GatewayTable, run: RunId) -> bool {
+        table.find(run).is_err()
+    }
+
+    fn contains(table: &GatewayTable, (hub, epoch): RunId) -> bool {
+        knows(table, hub, epoch)
+    }
+
+    fn is_full(table: &GatewayTable) -> bool {
+        table.run_count == MAX_RUNS
+    }
+
+    #[test]
+    fn a_greater_epoch_retires_the_older_one_of_its_hub() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for (hub, epoch, expected) in [
+            (1, 7, Ok(Fresh::New)),
+            (2, 3, Ok(Fresh::New)),
+            (1, 6, Err(DatagramError::Epoch)),
+            (1, 8, Ok(Fresh::New)),
+            (1, 7, Err(DatagramError::Epoch)),
+            (2, 3, Ok(Fresh::Duplicate)),
+        ] {
+            assert_eq!(fresh(&mut table, &zones(head(hub, epoch, 0))), expected, "{hub} {epoch}");
+        }
+        let rows: Vec<_> = table.rows().map(|row| (row.hub, row.epoch, row.received)).collect();
+        assert_eq!(rows, [(1, 7, 1), (1, 8, 1), (2, 3, 1)]);
+        assert_eq!(table.refused(DatagramError::Epoch), 2);
+    }
+
+    #[test]
+    fn what_is_refused_changes_nothing() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let damaged = |head: Head| {
+            let mut buffer = [0; 60];
+            head.seal(&mut buffer, 3).unwrap().to_vec()
+        };
+        let refused = [
+            (DatagramError::Payload, damaged(head(1, 2, 0))),
+            (DatagramError::Payload, zones(Head { revision: 0, ..head(1, 2, 0) })),
+            (DatagramError::Skipped, zones(Head { topic: 255, revision: 0, ..head(1, 2, 0) })),
+        ];
+        for (refusal, bytes) in &refused {
+            assert_eq!(fresh(&mut table, bytes), Err(*refusal));
+        }
+        assert_eq!(table.rows().count(), 0);
+        assert_eq!(fresh(&mut table, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was not believed");
+        assert_eq!(table.refused(DatagramError::Payload), 2);
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut table = full();
+        assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 1000), Err(DatagramError::Capacity));
+        assert_eq!(at(&mut table, &zones(head(1, 1, 2)), 1000), Ok(Fresh::New), "all go on");
+        for sensor in 1..=240 {
+            for hub in 0..4 {
+                let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
+                assert_eq!(at(&mut table, &bytes, 1000), Ok(Fresh::New));
+            }
+        }
+        let more = zones(Head { sensor: 241, ..head(1, 1, 0) });
+        assert_eq!(at(&mut table, &more, 3999), Err(DatagramError::Capacity));
+        assert_eq!((table.rows().count(), table.refused(DatagramError::Capacity)), (MAX_ROWS, 2));
+        assert_eq!(table.evicted(), EvictedTotals::default());
+        // Runs that were silent for three seconds make room. The totals keep their received samples.
+        assert_eq!(at(&mut table, &more, 4000), Ok(Fresh::New));
+        assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 4000), Ok(Fresh::New));
+        let sum = table.evicted();
+        assert_eq!(
+            (sum.runs, sum.displaced, sum.lost),
+            (1, 1, 0),
+            "one went for the row, and left its place"
+        );
+        let counted: u64 = table.rows().map(|row| row.received).sum();
+        assert_eq!(counted + sum.received, 128 + 1 + 4 * 240 + 2);
+    }
+
+    #[test]
+    fn a_true_gateway_is_heard_at_once_after_any_number_of_invented_ones() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for number in 0..2 {
+            assert_eq!(
+                at(&mut table, &zones(head(9999, 1, number)), 1000 * u64::from(number)),
+                Ok(Fresh::New)
+            );
+        }
+        for (now_ms, bytes) in [(1001, announce(0, 10)), (1002, zones(head(0, 1, 0)))] {
+            for hub in 0..1000 {
+                let mut forged = bytes.clone();
+                forged[8..10].copy_from_slice(&(hub as u16).to_le_bytes());
+                let Datagram { mut head, payload, .. } = Datagram::read(&bytes).unwrap();
+                head.hub = hub;
+                forged[HEAD..].copy_from_slice(payload);
+                let forged = head.seal(&mut forged, payload.len()).unwrap();
+                assert!(at(&mut table, forged, now_ms).is_ok());
+            }
+        }
+        assert_eq!(at(&mut table, &zones(head(7777, 1, 0)), 1003), Ok(Fresh::New));
+        assert!(knows(&table, 9999, 1) && knows(&table, 7777, 1), "{:?}", table.evicted());
+        assert_eq!(table.evicted().displaced, table.evicted().runs);
+    }
+
+    #[test]
+    fn two_gateways_with_one_number_and_one_epoch_are_never_mixed() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
+            table.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
+        };
+        let announce = |boot: u64, number: u32| {
+            let mut buffer = [0; 200];
+            let len = Announce::new(boot, "front", "").pack(&mut buffer[HEAD..]).unwrap();
+            Head { topic: 0, ..head(5, 1, number) }.seal(&mut buffer, len).unwrap().to_vec()
+        };
+        for n in 0..30_u32 {
+            let now_ms = 100 * u64::from(n);
+            if n % 10 == 0 {
+                assert_eq!(hear(1, &announce(7, n / 10), now_ms), Ok(Fresh::New));
+                assert_eq!(hear(2, &announce(8, n / 10), now_ms), Err(DatagramError::Twin));
+            }
+            assert_eq!(hear(1, &zones(head(5, 1, n)), now_ms), Ok(Fresh::New));
+            assert_eq!(hear(2, &zones(head(5, 1, 500 + n)), now_ms + 50), Err(DatagramError::Twin));
+        }
+        // The second gateway continues alone. It never replaces the first one.
+        assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
+        assert_eq!(hear(2, &zones(head(5, 1, 101)), 60_000), Err(DatagramError::Twin));
+        assert_eq!(hear(1, &zones(head(5, 1, 30)), 60_001), Ok(Fresh::New));
+        assert!(table.is_shared(5, 1));
+        assert_eq!(table.refused(DatagramError::Twin), 35);
+    }
+
+    #[test]
+    fn whoever_follows_a_silent_gateway_begins_anew() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
+            table.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
+        };
+        for n in 0..30 {
+            assert_eq!(hear(1, &zones(head(5, 1, 200 + n)), 100 * u64::from(n)), Ok(Fresh::New));
+        }
+        // Its numbers start again, and none of the first gateway's numbers count as lost.
+        assert_eq!(hear(2, &zones(head(5, 1, 100)), 5899), Err(DatagramError::Twin));
+        assert_eq!(hear(2, &zones(head(5, 1, 101)), 5900), Ok(Fresh::New));
+        assert!(!table.is_shared(5, 1), "a new run");
+        let rows: Vec<_> = table.rows().map(|row| (row.received, row.lost())).collect();
+        assert_eq!(rows, [(1, 0)]);
+        let evicted = table.evicted();
+        assert_eq!((evicted.runs, evicted.displaced, evicted.received, evicted.lost), (1, 0, 30, 0));
+        assert_eq!(table.refused(DatagramError::Twin), 1);
+    }
+
+    #[test]
+    fn what_is_retired_makes_room_and_stays_in_the_sum() {
+        let mut table = full();
+        let fresh = |table: &mut GatewayTable, bytes: &[u8]| at(table, bytes, 1000);
+        assert_eq!(fresh(&mut table, &zones(head(5, 1, 4))), Ok(Fresh::New));
+        // A gateway that restarts is accepted even though the table is full.
+        assert_eq!(fresh(&mut table, &zones(head(5, 2, 0))), Ok(Fresh::New));
+        let mut evicted = EvictedTotals { runs: 1, received: 3, lost: 2, ..EvictedTotals::default() };
+        assert_eq!((table.evicted(), table.rows().count()), (evicted, 64));
+        assert_eq!(
+            fresh(&mut table, &zones(head(5, 1, 5))),
+            Err(DatagramError::Epoch),
+            "given up is not forgotten"
+        );
+        assert!(knows(&table, 5, 2) && !knows(&table, 5, 1));
+        // A damaged datagram evicts nothing.
+        let mut buffer = [0; 60];
+        let damaged = head(5, 3, 0).seal(&mut buffer, 3).unwrap();
+        assert_eq!(fresh(&mut table, damaged), Err(DatagramError::Payload));
+        assert!(knows(&table, 5, 2) && !knows(&table, 5, 3));
+        // Fills the table with sensors of a run that then retires. One more row evicts it.
+        for sensor in 1..=240 {
+            for hub in 0..4 {
+                let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
+                assert_eq!(fresh(&mut table, &bytes), Ok(Fresh::New));
+            }
+        }
+        assert_eq!(fresh(&mut table, &zones(head(2, 9, 0))), Ok(Fresh::New));
+        evicted = EvictedTotals { runs: 2, received: 3 + 242, ..evicted };
+        assert_eq!((table.evicted(), table.rows().count()), (evicted, MAX_ROWS - 240));
+        let counted: u64 = table.rows().map(|row| row.received).sum();
+        assert_eq!(counted + evicted.received, 128 + 2 + 4 * 240 + 1);
+    }
+
+    #[test]
+    fn announcements_count_for_topics_that_are_listened_to() {
+        let mut table = GatewayTable::new(&[Topic::Zones]);
+        assert_eq!(fresh(&mut table, &announce(1, 10)), Ok(Fresh::New));
+        assert_eq!(
+            table.rows().map(|row| row.topic).collect::<Vec<_>>(),
+            [0],
+            "nothing sent, nothing to tell"
+        );
+        assert_eq!(fresh(&mut table, &announce(1, 12)), Ok(Fresh::Duplicate));
+        let rows: Vec<_> = table.rows().map(|row| (row.topic, row.received, row.lost())).collect();
+        assert_eq!(rows, [(0, 1, 0), (Topic::Zones.number(), 0, 2)]);
+    }
+
+    #[test]
+    fn the_longest_retired_one_is_given_up() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for run in [(1, 5), (2, 5), (3, 5), (2, 6), (1, 9), (2, 7)] {
+            assert_eq!(hear(&mut table, run, delivers(0)), None);
+        }
+        assert!(contains(&table, (2, 5)) && is_over(&table, (1, 8)) && !is_over(&table, (1, 9)));
+        let mut evict = || {
+            let displaced = table.evicted().displaced;
+            table.evict((9, 9), announces(0)).map(|run| (run, table.evicted().displaced > displaced))
+        };
+        let retired = [(2, 5), (1, 5), (2, 6)].map(|run| Some((run, false)));
+        assert_eq!([(); 3].map(|()| evict()), retired);
+        assert_eq!(evict(), None, "the others deliver");
+        assert!(
+            is_over(&table, (2, 6)) && !contains(&table, (2, 6)),
+            "its gateway goes on with a greater epoch"
+        );
+        assert!(contains(&table, (1, 9)) && contains(&table, (2, 7)) && contains(&table, (3, 5)));
+    }
+
+    #[test]
+    fn who_starts_again_makes_its_own_room() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for hub in 0..MAX_RUNS as u64 {
+            assert!(!is_full(&table));
+            assert_eq!(hear(&mut table, (hub, 1), delivers(0)), None);
+            hear(&mut table, (hub, 1), delivers(1000));
+        }
+        let now = delivers(1001);
+        assert!(
+            is_full(&table) && !table.has_room((99, 1), false, now) && table.has_room((7, 2), false, now)
+        );
+        assert_eq!(hear(&mut table, (7, 2), now), Some((7, 1)));
+        assert!(
+            is_full(&table) && is_over(&table, (7, 1)) && !table.has_room((9, 1), false, announces(1002))
+        );
+    }
+
+    #[test]
+    fn who_only_announces_never_puts_out_who_delivers() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        assert_eq!(hear(&mut table, (1, 1), delivers(0)), None);
+        assert_eq!(hear(&mut table, (2, 1), delivers(0)), None);
+        for n in 1..30_000 {
+            // One gateway delivers ten times a second, the other one delivered once. Every millisecond, an attacker
+            // invents another.
+            if n % 100 == 0 {
+                assert_eq!(hear(&mut table, (1, 1), delivers(n)), None, "{n}");
+            }
+            let gone = hear(&mut table, (1000 + n, 1), announces(n));
+            assert!(gone.is_none_or(|(hub, _)| hub >= 1000 || hub == 2 && n >= 3000), "{n}: {gone:?}");
+        }
+        assert!(contains(&table, (1, 1)) && !contains(&table, (2, 1)));
+    }
+
+    #[test]
+    fn who_is_known_to_deliver_is_not_put_out_by_one_that_begins_to() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let mut displaced = 0;
+        for n in 0..30_000 {
+            if n % 100 == 0 && !(10_000..20_000).contains(&n) {
+                assert_eq!(
+                    hear(&mut table, (1, 1), delivers(n)),
+                    None,
+                    "{n}: and its silence is not that long"
+                );
+            }
+            if n > 1000 {
+                displaced += u32::from(hear(&mut table, (1000 + n, 1), delivers(n)).is_some());
+            }
+        }
+        assert!(contains(&table, (1, 1)) && displaced > 28_000);
+    }
+
+    #[test]
+    fn the_oldest_silence_goes_first() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for hub in 0..MAX_RUNS as u64 {
+            for at_ms in [0, 2000 + hub] {
+                assert_eq!(hear(&mut table, (hub, 1), delivers(at_ms)), None);
+            }
+        }
+        assert!(!table.has_room((99, 1), false, delivers(4999)));
+        assert_eq!(hear(&mut table, (99, 1), delivers(5000)), Some((0, 1)));
+        assert_eq!(hear(&mut table, (100, 1), announces(6000)), Some((1, 1)));
+        assert_eq!(hear(&mut table, (101, 1), announces(6001)), Some((100, 1)), "it never delivered");
+    }
+
+    #[test]
+    fn names_come_with_announcements() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let head = Head { sensor: 1, ..head(5, 9, 0) };
+        table.begin((5, 9), delivers(0));
+        assert_eq!((table.printed_name(&head).as_str(), table.name(5, 9, 1).as_str()), ("#1", "#1"));
+        let is_named =
+            |table: &mut GatewayTable, name| table.announce(&head, &Announce::new(3, name, ""), 0).1;
+        assert_eq!([is_named(&mut table, "rear"), is_named(&mut table, "rear")], [true, false]);
+        assert_eq!((table.name(5, 9, 1).as_str(), table.name(5, 8, 1).as_str()), ("rear", "#1"));
+    }
+
+    #[test]
+    fn a_row_of_two_sensors_has_the_name_of_neither() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let row = Row::new((5, 9, 0, 4), 0);
+        table.begin((5, 9), delivers(0));
+        let mut announce = |boot, name| {
+            table.announce(&head(5, 9, 0), &Announce::new(boot, name, ""), 0);
+            (table.name(5, 9, 0), table.row_name(&row))
+        };
+        assert_eq!(announce(3, "front"), ("front".into(), "front".into()));
+        assert_eq!(announce(4, "front"), ("front".into(), "front".into()), "the hub's next run");
+        assert_eq!(announce(5, "rear"), ("rear".into(), "#0".into()));
+        assert_eq!(announce(6, "front"), ("front".into(), "#0".into()));
+    }
+
+    #[test]
+    fn evicted_runs_are_forgotten() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for epoch in 1..300 {
+            table.receive(&zones(head(5, epoch, 0)), 1, 0).unwrap();
+            table.announce(&head(5, epoch, 0), &Announce::new(3, "rear", ""), 0);
+        }
+        assert_eq!((table.run_count, table.evicted().runs), (MAX_RUNS, 299 - MAX_RUNS as u64));
+        assert_eq!((table.name(5, 299, 0).as_str(), table.name(5, 1, 0).as_str()), ("rear", "#0"));
+    }
+
+    #[test]
+    fn clocks_that_differ_give_no_age_and_are_reported_once() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let head = |epoch, stamp_ms| Head { stamp_ns: stamp_ms * MS, ..head(5, epoch, 0) };
+        let age_ns = |table: &GatewayTable, stamp_ms, wall_ms| table.age_ns(&head(1, stamp_ms), wall_ms * MS);
+        let announce = |table: &mut GatewayTable, epoch, stamp_ms, wall_ms| {
+            if table.run((5, epoch)).is_none() {
+                table.begin((5, epoch), delivers(0));
+            }
+            table.announce(&head(epoch, stamp_ms), &Announce::new(1, "front", ""), wall_ms * MS).0
+        };
+        assert_eq!(age_ns(&table, 1, 2), None, "not known yet");
+        assert_eq!(announce(&mut table, 1, 100, 101), None);
+        assert_eq!((age_ns(&table, 200, 230), age_ns(&table, 200, 199)), (Some(30 * MS), None));
+        assert_eq!(announce(&mut table, 1, 100, 900), None, "one that waited");
+        assert_eq!(announce(&mut table, 1, 3000, 1000), Some(-2000 * MS as i64));
+        assert_eq!(announce(&mut table, 1, 4000, 2000), None);
+        assert_eq!(age_ns(&table, 5000, 3030), None);
+        assert!((2..1000).all(|epoch| announce(&mut table, epoch, 3000, 1000).is_none()), "the same gateway");
+    }
+
+    #[test]
+    fn epochs_of_gateways_with_the_key_are_bounded() {
+        let epochs = (0..2000).map(|hub| (hub, 2000 - hub as u32)).collect();
+        let mut table = GatewayTable::new(&Topic::ALL).keyed(epochs);
+        assert_eq!(table.take_epochs(), None);
+        table.keep_epoch(10_000, 1);
+        let kept = table.take_epochs().unwrap();
+        assert_eq!((kept.len(), kept.get(&0), kept.get(&1023)), (MAX_EPOCHS, Some(&2000), None));
+        (20_000..25_000).for_each(|hub| table.keep_epoch(hub, 1));
+        let kept = table.take_epochs().unwrap();
+        assert_eq!((kept.len(), kept.contains_key(&24_999)), (MAX_EPOCHS, true));
+        assert_eq!(table.gateways.len(), MAX_EPOCHS);
+    }
+}

@@ -1,0 +1,466 @@
+//! The topics of one remote sensor: their numbers and periods, and its state while nothing arrives.
+
+use scanhub_schema::datagram::{Announce, Head, MTU_ETHERNET, Packed};
+use scanhub_schema::{Failure, Header, State, Status, Topic, Wake, Zones};
+
+use super::SensorTopics;
+use crate::lan::incoming::{CheckedPayload, Remote};
+use crate::lan::{Arrival, Stamp, Standing};
+
+/// A sensor of another machine.
+pub(super) struct RemoteSensor<T: SensorTopics> {
+    /// Name in this domain, `HUB.SENSOR`.
+    pub(super) name: String,
+    /// Gateway, its epoch, and the sensor's number, as last announced.
+    source: Option<(u64, u32, u8)>,
+    /// Bit n is set if the last announcement has topic number n.
+    announced: u64,
+    /// Rank when there is no room for another sensor.
+    pub(super) standing: Standing,
+    /// Whether it was reported that all announced topics exist.
+    pub(super) is_told: bool,
+    /// By topic.
+    streams: [Option<Stream>; Topic::ALL.len()],
+    /// Last status with its header.
+    last: Option<(Status, Header)>,
+    /// Header of the last zones.
+    zoned: Option<Header>,
+    /// Time of the last sample, in ns of CLOCK_MONOTONIC; `None` while the sensor is silent.
+    heard_ns: Option<u64>,
+    /// Reason for which subscribers must be woken.
+    news: Option<Wake>,
+    /// Process that publishes it.
+    pid: u32,
+    topics: T,
+}
+
+/// Outcome of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Outcome {
+    /// The sample was published.
+    Published,
+    /// The sensor has no such topic.
+    NoTopic,
+    /// The memory that remote sensors may use has no room for so long a sample.
+    NoRoom,
+}
+
+/// Time without a sample after which the sensor counts as silent: three announcements.
+const SILENT_AFTER_NS: u64 = 3_000_000_000;
+
+impl<T: SensorTopics> RemoteSensor<T> {
+    /// Creates the sensor `name`, which process `pid` publishes. It has no `topics` yet.
+    pub(super) fn new(name: &str, topics: T, pid: u32) -> RemoteSensor<T> {
+        RemoteSensor {
+            name: name.to_owned(),
+            source: None,
+            announced: 0,
+            standing: Standing::NONE,
+            is_told: false,
+            streams: [const { None }; Topic::ALL.len()],
+            last: None,
+            zoned: None,
+            heard_ns: None,
+            news: None,
+            pid,
+            topics,
+        }
+    }
+
+    /// Returns whether the topic exists.
+    pub(super) fn has(&self, topic: Topic) -> bool {
+        self.streams[topic as usize].is_some()
+    }
+
+    /// Creates `topic`, which does not exist.
+    pub(super) fn add(&mut self, topic: Topic) -> Result<(), Failure> {
+        self.topics.add(topic)?;
+        self.streams[topic as usize] = Some(Stream::default());
+        Ok(())
+    }
+
+    /// Removes `topic`.
+    pub(super) fn remove(&mut self, topic: Topic) {
+        self.topics.remove(topic);
+        self.streams[topic as usize] = None;
+    }
+
+    /// Records `announce` with `head`, which belongs to this sensor.
+    pub(super) fn announced(&mut self, head: &Head, announce: &Announce, arrival: Arrival) {
+        self.standing.take(arrival);
+        self.source = Some((head.hub, head.epoch, head.sensor));
+        let numbers = announce.topics().iter().map(|announced| announced.topic).filter(|number| *number < 64);
+        self.announced = numbers.fold(0, |bits, number| bits | 1 << number);
+    }
+
+    /// Publishes that the sensor is silent, because another one has its number or its place from now on.
+    pub(super) fn replaced(&mut self, now: Stamp) {
+        self.source = None;
+        self.heard_ns = None;
+        if let Some(header) = self.zoned.take().filter(|_| self.has(Topic::Zones)) {
+            self.send(Topic::Zones, &stamped(header, now), &Zones::unknown());
+            self.news = Some(Wake::Telegram);
+        }
+        self.silent(now);
+        self.wake();
+    }
+
+    /// Returns whether its gateway sends this topic.
+    pub(super) fn is_announced(&self, topic: Topic) -> bool {
+        self.announced >> topic.number() & 1 == 1
+    }
+
+    /// Returns whether this sensor sent `head`.
+    pub(super) fn is(&self, head: &Head) -> bool {
+        self.source == Some((head.hub, head.epoch, head.sensor))
+    }
+
+    /// Returns whether it belongs to this gateway and epoch.
+    pub(super) fn is_of(&self, hub: u64, epoch: u32) -> bool {
+        self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
+    }
+
+    /// Publishes `remote` if the sensor has the topic and room for the sample.
+    pub(super) fn publish(&mut self, remote: &Remote<'_>) -> Outcome {
+        self.heard_ns = Some(remote.arrival_ns);
+        self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
+        let topic = remote.topic;
+        let Some(stream) = &mut self.streams[topic as usize] else { return Outcome::NoTopic };
+        // Its number is skipped before the next sample that fits.
+        if !self.topics.fits(topic, remote.payload) {
+            return Outcome::NoRoom;
+        }
+        let Placed { left_out, header } = stream.place(remote, self.pid);
+        self.topics.skip(topic, left_out);
+        if topic != Topic::Status {
+            self.topics.send(topic, &header, remote.payload);
+        } else if let Some(status) = remote.payload.unpack::<Status>() {
+            self.publish_status(*status, &header);
+        }
+        if topic == Topic::Zones {
+            self.zoned = Some(remote.header(self.pid));
+        }
+        let why = if topic == Topic::Status { Wake::Status } else { Wake::Telegram };
+        self.news = match self.news {
+            Some(Wake::Telegram) => Some(Wake::Telegram),
+            _ => Some(why),
+        };
+        Outcome::Published
+    }
+
+    /// Wakes the subscribers if something was published since the last call.
+    pub(super) fn wake(&mut self) {
+        if let Some(why) = self.news.take() {
+            self.topics.wake(why);
+        }
+    }
+
+    /// Publishes that the sensor is silent, once per silence, if it was silent at `read`. Sends the history to late joiners.
+    pub(super) fn look(&mut self, read: Stamp) {
+        if self.heard_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
+            self.heard_ns = None;
+            self.silent(read);
+            self.wake();
+        }
+        let keeps = |topic: &Topic| topic.row().kept > 0 && self.has(*topic);
+        Topic::ALL.into_iter().filter(keeps).for_each(|topic| self.topics.connect(topic));
+    }
+
+    /// Returns the number of samples for which there was no memory.
+    pub(super) fn failed(&self) -> u64 {
+        self.topics.failed()
+    }
+
+    /// Publishes a received status. The start of its state is in time of another machine's clock, so it is replaced by the
+    /// time at which the state was received first.
+    fn publish_status(&mut self, mut status: Status, header: &Header) {
+        let same = self.last.filter(|(last, _)| last.state == status.state);
+        status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
+        self.last = Some((status, *header));
+        if self.has(Topic::Status) {
+            self.send(Topic::Status, header, &status);
+        }
+    }
+
+    /// Publishes that the sensor is silent, because its last status would otherwise remain forever.
+    fn silent(&mut self, now: Stamp) {
+        let Some((mut status, header)) = self.last else { return };
+        status.state = State::Silent as u8;
+        status.rate_mhz = 0;
+        status.set_last_error("nothing arrives over the network");
+        if self.has(Topic::Status) {
+            self.publish_status(status, &stamped(header, now));
+            self.news = self.news.or(Some(Wake::Status));
+        }
+    }
+
+    /// Publishes a payload that was not received in this form.
+    fn send(&mut self, topic: Topic, header: &Header, payload: &impl Packed) {
+        let mut room = [0; MTU_ETHERNET];
+        let Some(len) = payload.pack(&mut room) else { return };
+        let payload = CheckedPayload { bytes: &room[..len], room: len };
+        self.topics.send(topic, header, payload);
+    }
+}
+
+/// Returns `header` with the stamps of this moment, for a sample that was not received.
+fn stamped(header: Header, now: Stamp) -> Header {
+    let Stamp { monotonic_ns, wall_ns } = now;
+    Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
+}
+
+/// Numbers and period of one topic. Its numbers continue over runs of the gateway, and restart with each run of the hub, so that
+/// subscribers see what the network lost.
+#[derive(Default)]
+struct Stream {
+    /// Epoch, sensor's number and sequence number of the last sample. The first sample keeps its sequence number, so that
+    /// subscribers that outlive a listener see what was lost in between.
+    last: Option<(u32, u8, u32)>,
+    arrivals: PeriodEstimator,
+}
+
+/// Number and header of a sample in this domain.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Placed {
+    /// Numbers of the topic that are skipped before it, because their samples are missing.
+    left_out: u64,
+    /// Header with the period of sending, without the number in the topic.
+    header: Header,
+}
+
+impl Stream {
+    /// Places `remote`, which is not late, as the next sample of the topic, which process `pid` publishes. All numbers between
+    /// the last one and it are skipped, whether they were lost or not published. In a new run of the gateway, these are all
+    /// numbers before it. If the sensor has another number than before, none is skipped, because they may belong to another
+    /// sensor.
+    fn place(&mut self, remote: &Remote<'_>, pid: u32) -> Placed {
+        let head = &remote.head;
+        let next = (head.epoch, head.sensor, head.sequence);
+        let steps = self.last.and_then(|last| steps(last, next));
+        let left_out = match (steps, self.last) {
+            (Some(steps), _) => steps.wrapping_sub(1),
+            (None, Some((epoch, ..))) if head.epoch == epoch => 0,
+            (None, _) => head.sequence,
+        };
+        self.last = Some(next);
+        let period_us = self.arrivals.period_us(remote.arrival_ns, steps.unwrap_or_default().into());
+        Placed { left_out: left_out.into(), header: Header { period_us, ..remote.header(pid) } }
+    }
+}
+
+/// Returns by how much `next` is ahead of `last`, each with its epoch and the sensor's number. `None` if they belong to
+/// different sequences. Late samples are not published, so a lower number belongs to a sender that replaced a silent one.
+fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
+    let steps = next.2.wrapping_sub(last.2);
+    ((next.0, next.1) == (last.0, last.1) && steps <= u32::MAX / 2).then_some(steps)
+}
+
+/// Estimates the period at which samples of a topic are sent. A gateway may leave out samples, which its datagrams do not
+/// indicate.
+#[derive(Default)]
+struct PeriodEstimator {
+    last_ns: Option<u64>,
+    /// Times between the last samples as they were sent, in ns.
+    distances_ns: [u64; KEPT],
+    count: usize,
+}
+
+/// Number of times that count. Two gaps and a burst among them do not change the median.
+const KEPT: usize = 5;
+
+/// Maximum period. A longer time is a silence, and a verdict of that age is useless.
+const MAX_PERIOD_NS: u64 = 2_500_000_000;
+
+impl PeriodEstimator {
+    /// Records a sample that arrived at `now_ns`, `steps` numbers after the last one; 0 if that is unknown. Returns the period
+    /// in us: the median of the last times, the shorter one of two, or 0 while it is unknown. Lost samples do not extend
+    /// it, because a verdict would otherwise be valid for longer on a bad link than on a good one.
+    fn period_us(&mut self, now_ns: u64, steps: u64) -> u32 {
+        let before_ns = self.last_ns.replace(now_ns);
+        let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
+        if let Some(distance_ns) = distance_ns.filter(|distance_ns| *distance_ns <= MAX_PERIOD_NS) {
+            self.distances_ns[self.count % KEPT] = distance_ns;
+            self.count += 1;
+        }
+        let mut known = self.distances_ns;
+        let known = &mut known[..self.count.min(KEPT)];
+        known.sort_unstable();
+        let median_ns = known.get(known.len().saturating_sub(1) / 2);
+        median_ns.map_or(0, |median_ns| (median_ns / 1000) as u32)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use scanhub_schema::datagram::{Datagram, HEAD};
+
+    /// What was said of a sensor's status: the state, and its stamps in ms.
+    #[derive(Default)]
+    struct Said(Vec<(Option<State>, u64, u64)>);
+
+    impl SensorTopics for Said {
+        fn add(&mut self, _: Topic) -> Result<(), Failure> {
+            Ok(())
+        }
+
+        fn remove(&mut self, _: Topic) {}
+
+        fn skip(&mut self, _: Topic, _: u64) {}
+
+        fn send(&mut self, _: Topic, header: &Header, payload: CheckedPayload<'_>) {
+            let mut status = Status::default();
+            assert!(status.unpack(payload.bytes));
+            self.0.push((status.state(), header.stamp_last_ns / MS, status.since_ns / MS));
+        }
+
+        fn connect(&self, _: Topic) {}
+
+        fn wake(&self, _: Wake) {}
+
+        fn failed(&self) -> u64 {
+            0
+        }
+    }
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn a_silence_is_said_as_of_when_everything_was_read() {
+        let mut sensor = RemoteSensor::new("robot1.front", Said::default(), 1);
+        sensor.add(Topic::Status).unwrap();
+        let mut bytes = [0; MTU_ETHERNET];
+        let status = Status { state: State::Streaming as u8, ..Status::default() };
+        let len = status.pack(&mut bytes[HEAD..]).unwrap();
+        let head = Head { topic: Topic::Status.number(), revision: 1, hub: 5, epoch: 1, ..Head::default() };
+        let datagram = Datagram::read(head.seal(&mut bytes, len).unwrap()).unwrap();
+        let came = |ms| Remote {
+            topic: Topic::Status,
+            head: datagram.head,
+            payload: CheckedPayload { bytes: datagram.payload, room: len },
+            boot: 1,
+            arrival_ns: ms * MS,
+            age_ns: None,
+            late: false,
+            authenticated: false,
+        };
+        let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
+        assert_eq!(sensor.publish(&came(1_000)), Outcome::Published);
+        // The listener is behind: what came at 4.6 s is the next that it will read.
+        [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.look(read(ms)));
+        assert_eq!(sensor.publish(&came(4_600)), Outcome::Published);
+        sensor.look(read(5_000));
+        let (streams, silent) = (Some(State::Streaming), Some(State::Silent));
+        assert_eq!(
+            sensor.topics.0,
+            [(streams, 1_000, 1_000), (silent, 4_500, 4_500), (streams, 4_600, 4_600)]
+        );
+    }
+
+    #[test]
+    fn numbers_that_begin_anew_are_of_another_count() {
+        assert_eq!(steps((1, 0, 100), (1, 0, 103)), Some(3));
+        assert_eq!(steps((1, 0, u32::MAX), (1, 0, 1)), Some(2));
+        assert_eq!(steps((1, 0, 100), (1, 0, 20)), None);
+        assert_eq!(steps((1, 0, 100), (2, 0, 103)), None);
+        assert_eq!(steps((1, 0, 100), (1, 1, 103)), None);
+    }
+
+    use scanhub_client::clock::Moment;
+    use scanhub_client::streams::Freshness;
+    use scanhub_schema::{Flags, Header, Verdict};
+
+    fn periods_ms(arrivals_ms: &[u64]) -> Vec<u32> {
+        let mut arrivals = PeriodEstimator::default();
+        arrivals_ms.iter().map(|at_ms| arrivals.period_us(at_ms * MS, 1) / 1000).collect()
+    }
+
+    #[test]
+    fn it_is_the_median_of_the_last_distances() {
+        assert_eq!(periods_ms(&[100, 600, 1600, 2100, 2600]), [0, 500, 500, 500, 500]);
+        // What was lost, and what waited and came in a burst.
+        assert_eq!(
+            periods_ms(&[0, 100, 200, 500, 600, 901, 902, 903]),
+            [0, 100, 100, 100, 100, 100, 100, 100]
+        );
+        // Thinned from now on: three tell.
+        assert_eq!(periods_ms(&[0, 20, 40, 60, 80, 100, 1100, 2100, 3100]).split_off(6), [20, 20, 1000]);
+    }
+
+    #[test]
+    fn what_is_lost_makes_it_no_longer() {
+        let mut arrivals = PeriodEstimator::default();
+        let mut came = |at_ms: u64, steps| arrivals.period_us(at_ms * MS, steps) / 1000;
+        assert_eq!([came(0, 1), came(20, 1), came(2_020, 100), came(4_020, 100)], [0, 20, 20, 20]);
+        assert_eq!(came(64_020, 3_000), 20, "out of sight for a minute");
+        // Another life of the gateway: how many of its numbers are of the time between is not known.
+        assert_eq!([came(65_020, 0), came(65_040, 1), came(65_060, 1)], [20, 20, 20]);
+    }
+
+    #[test]
+    fn a_silence_is_no_period() {
+        assert_eq!(periods_ms(&[0, 90_000, 90_020, 190_000, 190_020]), [0, 0, 20, 20, 20]);
+        assert_eq!(periods_ms(&[0, 2_500, 5_001, 7_501]), [0, 2_500, 2_500, 2_500]);
+        assert_eq!(periods_ms(&[500, 400, 300]), [0, 0, 0], "a clock that goes back");
+    }
+
+    /// How often the verdict of a stream becomes unknown whose samples come every `period_ms` for a minute, and how long
+    /// after its end it does so for good.
+    /// Of `sent` one comes.
+    fn followed(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
+        let (mut arrivals, mut freshness) = (PeriodEstimator::default(), Freshness::new(at(0)));
+        let mut silences = 0;
+        let mut next_ms = 0;
+        let mut last_ms = 0;
+        for ms in 0..75_000 {
+            let now = at(ms);
+            if ms == next_ms && ms < 60_000 {
+                let period_us = arrivals.period_us(now.monotonic_ns, sent);
+                let header = Header {
+                    stamp_last_ns: now.monotonic_ns,
+                    period_us,
+                    flags: Flags::REMOTE,
+                    ..Header::default()
+                };
+                assert!(freshness.heard(&header, Verdict::Clear, now));
+                last_ms = ms;
+                let number = ms / period_ms + 1;
+                next_ms = number * period_ms + number * 7 % (jitter_ms + 1);
+            }
+            if freshness.silence(now) {
+                silences += 1;
+                if next_ms >= 60_000 {
+                    return (silences - 1, ms - last_ms);
+                }
+            }
+        }
+        panic!("never silent after the end");
+    }
+
+    fn at(ms: u64) -> Moment {
+        Moment { monotonic_ns: ms * MS, boottime_ns: ms * MS }
+    }
+
+    #[test]
+    fn a_verdict_is_as_fresh_as_its_stream_is_fast() {
+        for (period_ms, jitter_ms) in [(27, 0), (27, 20), (230, 0), (400, 60), (1_000, 100), (2_000, 200)] {
+            let (silences, ended_ms) = followed(period_ms, jitter_ms, 1);
+            let limit_ms = 2 * (period_ms + jitter_ms) + 41;
+            // Of a slow one it is not known before the second sample how slow it is.
+            let before_known = u32::from(period_ms > 500);
+            assert_eq!(silences, before_known, "a sample each {period_ms} ms");
+            assert!(
+                (500..=limit_ms.max(500)).contains(&ended_ms),
+                "a sample each {period_ms} ms: {ended_ms} ms"
+            );
+        }
+        assert!(followed(3_000, 0, 1).0 > 15, "too slow to be followed");
+    }
+
+    #[test]
+    fn a_bad_link_keeps_no_verdict_for_longer() {
+        // Each 30 ms one is sent, and one in two seconds comes: the verdict is known for a quarter of the time.
+        assert_eq!(followed(2_010, 0, 67), (29, 500));
+    }
+}
