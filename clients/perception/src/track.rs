@@ -22,11 +22,10 @@ use scanhub_schema::{EventKind, Foreground, Pose, Scan, TrackSensor, TrackState,
 use serde::Serialize;
 
 use self::geometry::Point;
-pub use self::sensor_view::LEGS;
 use self::site::Sensor;
 pub use self::site::Site;
-use self::tracker::Tracker;
-pub use self::tracker::{PERSONS, PICTURE_NS};
+pub use self::tracker::PICTURE_NS;
+use self::tracker::{PERSONS, Tracker};
 
 /// Maximum number of waiting scans of a sensor. One more makes the tracker take the oldest at once.
 const WAITING: usize = 64;

@@ -9,7 +9,7 @@ use super::geometry::{Point, distance, minus};
 use super::site::{Sensor, Site};
 
 /// Maximum number of legs in a scan.
-pub const LEGS: usize = 64;
+pub(crate) const LEGS: usize = 64;
 /// Radius of a leg with its trousers, in meters.
 pub(crate) const LEG_M: f64 = 0.06;
 /// Maximum width of a leg. A wider object is two legs next to each other.

@@ -15,11 +15,11 @@ use super::geometry::{
 use super::sensor_view::AtDoor;
 
 /// Maximum number of sensors of a site, which is the maximum number of links of a hub.
-pub const SENSORS: usize = 32;
+pub(crate) const SENSORS: usize = 32;
 /// Maximum number of rooms.
-pub const ROOMS: usize = 64;
+pub(crate) const ROOMS: usize = 64;
 /// Maximum number of ignored areas.
-pub const IGNORED: usize = 64;
+pub(crate) const IGNORED: usize = 64;
 
 /// A plan that was checked.
 #[derive(Clone, Debug, PartialEq)]
@@ -167,9 +167,9 @@ impl Sensor {
 }
 
 /// Maximum length of the name of a room or door in bytes, as in an event.
-pub const NAME: usize = 24;
+pub(crate) const NAME: usize = 24;
 /// Name of the other side of a door to the street.
-pub const OUTSIDE: &str = "outside";
+pub(crate) const OUTSIDE: &str = "outside";
 /// Maximum width of a leaf of a door, in meters.
 const WIDEST_LEAF_M: f64 = 1.3;
 /// Distance from a jamb within which an open leaf may end.

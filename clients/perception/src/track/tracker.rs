@@ -13,7 +13,7 @@ use super::site::{Door, Gap, Site};
 use super::{Event, Kind, Misplaced, Picture, Track};
 
 /// Maximum number of people at a time.
-pub const PERSONS: usize = 64;
+pub(crate) const PERSONS: usize = 64;
 /// Interval between pictures.
 pub const PICTURE_NS: u64 = 40_000_000;
 
