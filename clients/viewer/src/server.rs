@@ -6,7 +6,7 @@ mod channels;
 mod connection;
 mod foxglove;
 mod http;
-pub mod messages;
+pub(crate) mod messages;
 mod page;
 pub mod player;
 mod viewer;

@@ -11,72 +11,72 @@ use serde::Serialize;
 use super::channels::Channel;
 use crate::scene::{Problem, Scene, Sensor, rooms};
 
-pub use scene_update::{lines, marks, obstacles, tracks, zones};
+pub(crate) use scene_update::{lines, marks, obstacles, tracks, zones};
 
 /// Returns the channel of a sensor's scans, as `sensor_msgs/msg/LaserScan`.
-pub fn scan_channel(sensor: &str) -> Channel {
+pub(crate) fn scan_channel(sensor: &str) -> Channel {
     of_ros(scan_topic(sensor), LASER_SCAN, false)
 }
 
 /// Returns the channel of a sensor's foreground, as `sensor_msgs/msg/PointCloud2`.
-pub fn foreground_channel(sensor: &str) -> Channel {
+pub(crate) fn foreground_channel(sensor: &str) -> Channel {
     of_ros(beside_scan(sensor, "foreground"), POINT_CLOUD, false)
 }
 
 /// Returns the channel of a sensor's learned background, as `sensor_msgs/msg/LaserScan`.
-pub fn background_channel(sensor: &str) -> Channel {
+pub(crate) fn background_channel(sensor: &str) -> Channel {
     of_ros(beside_scan(sensor, "background"), LASER_SCAN, true)
 }
 
 /// Returns the channel of the sensors' poses, as `tf2_msgs/msg/TFMessage`.
-pub fn transforms_channel() -> Channel {
+pub(crate) fn transforms_channel() -> Channel {
     of_ros(TF_STATIC.to_owned(), TF_MESSAGE, true)
 }
 
 /// Returns the channel of the circles around the robot and the beams that violate them, as `foxglove.SceneUpdate`.
-pub fn zones_channel() -> Channel {
+pub(crate) fn zones_channel() -> Channel {
     scene_update::channel("/zones")
 }
 
 /// Returns the channel of the reflector marks, as `foxglove.SceneUpdate`.
-pub fn marks_channel() -> Channel {
+pub(crate) fn marks_channel() -> Channel {
     scene_update::channel("/marks")
 }
 
 /// Returns the channel of line features and corners, as `foxglove.SceneUpdate`.
-pub fn lines_channel() -> Channel {
+pub(crate) fn lines_channel() -> Channel {
     scene_update::channel("/lines")
 }
 
 /// Returns the channel of the people of `tracker` and their tails, as `foxglove.SceneUpdate`.
-pub fn tracks_channel(tracker: &str) -> Channel {
+pub(crate) fn tracks_channel(tracker: &str) -> Channel {
     scene_update::channel(&beside_scan(tracker, "tracks"))
 }
 
 /// Returns the channel of the points of complete sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
-pub fn cloud_channel(name: &str) -> Channel {
+pub(crate) fn cloud_channel(name: &str) -> Channel {
     of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
 }
 
 /// Returns the channel of the last sweep's obstacles, as `foxglove.SceneUpdate`. They are not kept for later
 /// subscribers, because a message is valid for a limited time after its arrival.
-pub fn obstacles_channel(name: &str) -> Channel {
+pub(crate) fn obstacles_channel(name: &str) -> Channel {
     Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
 }
 
 /// Returns the channel of the verdict and the hub, see [`robot`].
-pub fn robot_channel() -> Channel {
+pub(crate) fn robot_channel() -> Channel {
     json_channel("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
 }
 
 /// Returns the channel of a sensor's state, see [`status`].
-pub fn status_channel(sensor: &str) -> Channel {
+pub(crate) fn status_channel(sensor: &str) -> Channel {
     json_channel(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
 /// Encodes the verdict of the robot's sensors, whether they are shown in a map, the state of the hub, and the number of
 /// people in each room as text. `problem` is why there is no hub.
-pub fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> Vec<u8> {
+pub(crate) fn robot(scene: &Scene, domain: &str, problem: Option<&Problem>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
         verdict: &'a str,
@@ -119,7 +119,7 @@ fn hub_words(scene: &Scene, domain: &str) -> String {
 
 /// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a
 /// simulator or a recording.
-pub fn status(sensor: &Sensor) -> Vec<u8> {
+pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]
     struct SensorState<'a> {
         name: &'a str,
@@ -192,7 +192,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
 }
 
 /// Encodes the background of `sensor` as a scan: NaN where it is unknown, +inf where it is out of range.
-pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
+pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
     let as_scan = |range: &u16| match *range {
         Background::UNTAUGHT => Scan::NOT_MEASURED,
         Background::FAR => BEYOND,
@@ -216,7 +216,7 @@ pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Bac
 const BEYOND: u16 = u16::MAX - 1;
 
 /// Encodes the poses of the sensors, as far as they are known.
-pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+pub(crate) fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.placement.pose()?));
     let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
     let mut message = Vec::new();
@@ -225,13 +225,13 @@ pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Returns the channel of the angles of `mount`, see [`tilt`].
-pub fn tilt_channel(mount: &str) -> Channel {
+pub(crate) fn tilt_channel(mount: &str) -> Channel {
     let schema = include_str!("messages/tilt.json");
     Channel { is_kept: false, ..json_channel(beside_scan(mount, "tilt"), "scanhub.Tilt", schema) }
 }
 
 /// Encodes the angle of a mount, and its rate if that is known.
-pub fn tilt(tilt: &Tilt) -> Vec<u8> {
+pub(crate) fn tilt(tilt: &Tilt) -> Vec<u8> {
     #[derive(Serialize)]
     struct Angle {
         angle_deg: f64,

@@ -54,12 +54,12 @@ pub trait Playback: Sync {
 }
 
 /// Returns the channel of the player's progress, see [`message`].
-pub fn channel() -> Channel {
+pub(crate) fn channel() -> Channel {
     json_channel("/replay".to_owned(), "scanhub.Replay", include_str!("messages/replay.json"))
 }
 
 /// Encodes the progress as fields, and as text in `words`.
-pub fn message(progress: &Progress) -> Vec<u8> {
+pub(crate) fn message(progress: &Progress) -> Vec<u8> {
     #[derive(Serialize)]
     struct Replay<'a> {
         #[serde(flatten)]

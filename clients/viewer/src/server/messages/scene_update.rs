@@ -15,7 +15,7 @@ pub(super) fn channel(topic: &str) -> Channel {
 
 /// Encodes the circles of the robot's sensors, each with its radius and verdict as metadata. For each sensor with
 /// points inside a circle, adds the beam of the nearest point.
-pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+pub(crate) fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let around = circles(scene.robot().map(|(_, sensor)| sensor));
     let mut entities = Vec::new();
     for circle in &around {
@@ -49,7 +49,7 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 /// Encodes the people of one tracker with their IDs and tails. The ellipse around a person contains the true position
 /// in 95 of 100 cases. The frame is the robot's; with a tracker, that is the map of the site. People who are not seen
 /// are pale.
-pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
+pub(crate) fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
     let entities = people.known().map(|person| {
         let (x, y) = person.position;
         let color = Color { a: if person.is_seen() { 1.0 } else { PALE }, ..PERSON };
@@ -67,7 +67,7 @@ pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the line features of the robot's sensors, and their corners.
-pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+pub(crate) fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().filter_map(|(_, sensor)| {
         let found = sensor.lines()?;
         let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
@@ -84,7 +84,7 @@ pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the reflector marks of the robot's sensors.
-pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+pub(crate) fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().map(|(_, sensor)| {
         let mut entity = Entity::new(format!("marks {}", sensor.name), wall_ns);
         entity.add("sensor", sensor.name.clone());
@@ -98,7 +98,7 @@ pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 /// first entity has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`,
 /// and `words`, a summary as text. Sweeps end when the mount reverses, so each message deletes all earlier entities,
 /// and has its own lifetime.
-pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
+pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     let lifetime = || Time::of(lifetime_ns(header));
     let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };
     sweep.add("sweep", found.sweep.to_string());
