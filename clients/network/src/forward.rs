@@ -1,45 +1,40 @@
-//! A hub that is followed by what carries its samples away, over whatever network: its sensors as they come, its absence,
-//! and which topics go out. Refuses to know where samples go.
+//! Subscribes to the sensors of a hub and passes their samples to a network: sensors as they appear, the absence of the hub, and
+//! the selection of topics.
 
-mod account;
-mod life;
-mod machine;
 mod selection;
-mod sensor;
 
+use std::io::Write;
 use std::num::NonZeroU64;
-use std::path::Path;
 use std::time::{Duration, Instant};
 
-use crate::lan::outgoing::Sample;
-use scanhub_client::clock;
-use scanhub_client::streams::{GRACE, Session};
+use crate::lan::outgoing::{self, Outgoing, PayloadRef, Row};
+use scanhub_client::streams::{GRACE, Sample, Session, Source};
 use scanhub_schema::{Failure, Topic, check_sensor};
 use scanhub_shm::Domain;
 
-pub use account::account;
-pub use life::Life;
 use scanhub_verbs::discovery::Discovery;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::no_sensor;
 use scanhub_verbs::output::{End, Output};
-pub use selection::Selection;
-use sensor::Sensor;
+use serde::Serialize;
 
-/// What carries samples away.
+use crate::gateway_identity::Life;
+pub use selection::Selection;
+
+/// A network that takes samples.
 pub trait Carrier {
-    /// Takes the sensor called `name`, of whose topics every so many samples go out; nothing: none do. Returns its position,
-    /// by which it is named from now on.
+    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent. Returns the
+    /// sensor's position.
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize;
 
-    /// Returns whether samples of this topic are wanted.
+    /// Returns whether samples of this topic are needed.
     fn wants(&self, sensor: usize, topic: Topic) -> bool;
 
-    /// Takes a sample of the sensor at this position.
-    fn sample(&mut self, sensor: usize, sample: &Sample<'_>);
+    /// Sends a sample of the sensor at this position.
+    fn sample(&mut self, sensor: usize, sample: &outgoing::Sample<'_>);
 }
 
-/// The hub of a domain, as long as it is there and whenever it is again.
+/// Subscriptions to the hub of a domain, which may exit and start again.
 pub struct Forwarder {
     selection: Selection,
     session: Session,
@@ -47,15 +42,15 @@ pub struct Forwarder {
     started: Instant,
     discovery: Discovery,
     is_there: bool,
-    /// More sensors that have to be there, whatever goes out of them.
+    /// Further sensors that must exist, even if nothing of them is sent.
     demanded: Vec<String>,
-    /// The sensors that are named were found in a hub.
+    /// Whether the named sensors were found in a hub.
     is_checked: bool,
     waiting_said: bool,
 }
 
 impl Forwarder {
-    /// Follows what is selected of the hub in the first live one of `places`.
+    /// Subscribes to the selected topics of the hub in the first live one of `places`.
     pub fn new(selection: Selection, places: &[Domain], carrier: &mut impl Carrier) -> Forwarder {
         let named = selection.named().into_iter().map(|name| {
             let maker = selection.maker_of(name);
@@ -75,16 +70,16 @@ impl Forwarder {
         }
     }
 
-    /// Says that the user named `sensor` for something else than what goes out: it has to be there, too.
+    /// Requires that `sensor` exists, which the user named for another purpose.
     pub fn demand(&mut self, sensor: &str) {
         self.demanded.push(sensor.to_owned());
     }
 
-    /// Hands on what waits of all sensors; returns whether there may be more.
+    /// Passes waiting samples of all sensors to `carrier`. Returns whether there may be more.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if descriptors or memory are.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if descriptors or memory are short.
     pub fn forward(&mut self, carrier: &mut impl Carrier) -> Result<bool, Failure> {
         let (mut more, mut subscribed) = (false, false);
         for sensor in &mut self.sensors {
@@ -93,12 +88,12 @@ impl Forwarder {
         Ok(more)
     }
 
-    /// Looks for news of the hub, which go to `tell`, and for the sensors of one that came. To be called after
-    /// [`forward`](Forwarder::forward), as it takes longer.
+    /// Checks whether the hub has exited or started, which it reports to `tell`, and searches the sensors of a new one. Call it
+    /// after [`forward`](Forwarder::forward), because it takes longer.
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub that is met has not all sensors that are named, and what `tell` says.
+    /// Returns [`Kind::NoTopic`](scanhub_schema::Kind) if the first hub lacks a named sensor, and the errors of `tell`.
     pub fn look(
         &mut self,
         now: Instant,
@@ -111,7 +106,7 @@ impl Forwarder {
             self.discovery.end();
             tell(Notice::HubGone)?;
         }
-        // Somebody else may bring the sensors of other machines, which are not sent on.
+        // Another process may publish sensors of other machines, which are not sent again.
         if change.back.is_some() && self.session.hub_lives() {
             if self.discovery.has_begun() || self.waiting_said {
                 tell(Notice::HubBack)?;
@@ -126,29 +121,29 @@ impl Forwarder {
         Ok(self.discover(now, carrier)?)
     }
 
-    /// Waits until there is something to hand on or to look at, and no longer than `at_most`.
+    /// Waits for a sample or an event, but no longer than `at_most`.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`](scanhub_schema::Kind) if the system does not let it wait.
+    /// Returns [`Kind::Failed`](scanhub_schema::Kind) if the system cannot wait.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
         let left = self.sensors.iter().filter_map(Sensor::left).chain(self.discovery.left());
         self.session.wait_for(Some(left.fold(at_most, Duration::min)))?;
         Ok(())
     }
 
-    /// Returns whether the hub is there.
+    /// Returns whether the hub is running.
     pub fn is_there(&self) -> bool {
         self.is_there
     }
 
-    /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
+    /// Subscribes to new sensors of the hub if all are selected. The first hub must have all named sensors.
     fn discover(&mut self, now: Instant, carrier: &mut impl Carrier) -> Result<(), Failure> {
         let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
         let Some(called) = self.discovery.call(domain, now)? else { return Ok(()) };
         if self.selection.wants_all() {
             for name in &called.sensors {
-                // One that came from another machine has another name.
+                // The name of a remote sensor has another form.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
                 if !is_known && check_sensor(name).is_ok() {
                     let may_have = |topic| called.may_have(name, topic);
@@ -170,21 +165,160 @@ impl Forwarder {
     }
 }
 
-/// Tells a `notice` of the hub: a line of JSON to `out`, or text to `notes`.
+/// Reports a `notice` of the hub: a line of JSON to `out`, or text to `notes`.
 ///
 /// # Errors
 ///
-/// If it cannot be written.
+/// Returns the reason why output cannot be written.
 pub fn tell(notice: Notice, json: bool, out: &mut Output<'_>, notes: &mut Output<'_>) -> Result<(), End> {
     notice.tell(&[], json, out, notes)
 }
 
-/// Begins a life of the gateway of `domain` by this `way`, as `Life::begin`, on this machine and now.
+/// A subscribed sensor.
+struct Sensor {
+    name: String,
+    /// Position at the carrier.
+    position: usize,
+    sources: Vec<Source>,
+}
+
+/// Samples that are taken from one topic before the next one has its turn.
+const BATCH_SIZE: usize = 32;
+
+impl Sensor {
+    /// Creates subscriptions to the selected topics that the sensor `may_have`, and to its status if it is announced with its type.
+    fn new(
+        name: &str,
+        may_have: impl Fn(Topic) -> bool,
+        selection: &Selection,
+        carrier: &mut impl Carrier,
+    ) -> Sensor {
+        let every = |topic| selection.every(name, topic).filter(|_| may_have(topic));
+        let position = carrier.follow(name, &every);
+        let wanted =
+            Topic::ALL.into_iter().filter(|topic| may_have(*topic) && carrier.wants(position, *topic));
+        let sources = wanted.map(|topic| Source::new(name, topic)).collect();
+        Sensor { name: name.to_owned(), position, sources }
+    }
+
+    /// Passes waiting samples to `carrier`, and returns whether there may be more. Attaches at most one subscriber in each round
+    /// over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
+    ///
+    /// # Errors
+    ///
+    /// Returns the same errors as [`Source::receive`].
+    fn forward(
+        &mut self,
+        session: &mut Session,
+        carrier: &mut impl Carrier,
+        subscribed: &mut bool,
+    ) -> Result<bool, Failure> {
+        let mut more = false;
+        for source in &mut self.sources {
+            let is_new = !source.subscribed();
+            if is_new && *subscribed {
+                more = true;
+                continue;
+            }
+            for turn in 0..BATCH_SIZE {
+                let Some(sample) = source.receive(session)? else { break };
+                more |= turn + 1 == BATCH_SIZE;
+                carrier.sample(self.position, &borrowed(&sample));
+            }
+            *subscribed |= is_new && source.subscribed();
+        }
+        Ok(more)
+    }
+
+    /// Returns the time after which there may be a sample to send although the hub sends nothing.
+    fn left(&self) -> Option<Duration> {
+        self.sources.iter().filter_map(Source::left).min()
+    }
+}
+
+/// Generates access to the payload of a sample from the table of topics.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        fn payload(sample: &Sample) -> PayloadRef<'_> {
+            match sample {
+                $(Sample::$topic(sample) => PayloadRef::$topic(payloads!($topic sample)),)*
+                Sample::Robot(sample) => PayloadRef::Zones(&sample.heard.zones),
+            }
+        }
+    };
+    // Samples of zones have their age in addition.
+    (Zones $sample:ident) => {
+        &$sample.zones
+    };
+    ($topic:ident $sample:ident) => {
+        $sample
+    };
+}
+
+scanhub_schema::for_each_topic!(payloads);
+
+fn borrowed(sample: &Sample) -> outgoing::Sample<'_> {
+    outgoing::Sample { header: sample.header(), missed: sample.missed(), payload: payload(sample) }
+}
+
+/// Prints the counters of `outgoing` in this run: lines of JSON of this `class`, or text.
 ///
 /// # Errors
 ///
-/// As `Life::begin`, and if the environment names no place for its number.
-pub fn begin_life(domain: &str, way: &str) -> Result<Life, Failure> {
-    let now_s = clock::wall_ns() / 1_000_000_000;
-    Life::begin(&life::directory()?, domain, way, now_s, machine::machine(Path::new(machine::ID)))
+/// Returns the reason why output cannot be written.
+pub fn account(
+    outgoing: &Outgoing,
+    life: &Life,
+    class: &'static str,
+    json: bool,
+    out: &mut Output<'_>,
+) -> Result<(), End> {
+    let hub = format!("{:016x}", life.hub);
+    for sensor in outgoing.account() {
+        for (topic, row) in sensor.used() {
+            let topic = topic.map_or("announce", Topic::name);
+            let Row { sent, failed, bytes, missed, .. } = *row;
+            let replaced = outgoing.tells_replaced().then_some(row.replaced);
+            if json {
+                let (hub, epoch, sensor) = (&hub, life.epoch, &sensor.name);
+                let send_failed = failed;
+                out.json(&SentLine {
+                    class,
+                    hub,
+                    epoch,
+                    sensor,
+                    topic,
+                    sent,
+                    send_failed,
+                    bytes,
+                    missed,
+                    replaced,
+                })?;
+                continue;
+            }
+            out.line(|line| {
+                write!(line, "{}/{topic}: {sent} sent, ", sensor.name)?;
+                replaced.map_or(Ok(()), |replaced| write!(line, "{replaced} replaced, "))?;
+                write!(line, "{failed} failed, {bytes} bytes")?;
+                if missed > 0 { write!(line, ", {missed} missed") } else { Ok(()) }
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// Class `lan` or `bridge` of a sender.
+#[derive(Serialize)]
+struct SentLine<'a> {
+    class: &'static str,
+    hub: &'a str,
+    epoch: u32,
+    sensor: &'a str,
+    topic: &'static str,
+    sent: u64,
+    send_failed: u64,
+    bytes: u64,
+    missed: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    replaced: Option<u64>,
 }

@@ -24,7 +24,8 @@ use scanhub_verbs::lossy_writer::LossyWriter;
 use scanhub_verbs::output::{End, Output, quiet};
 use serde::Serialize;
 
-use crate::forward::{self, Forwarder, Selection, begin_life};
+use crate::forward::{self, Forwarder, Selection};
+use crate::gateway_identity::begin_life;
 use crate::lan::Key;
 use crate::lan::outgoing::{ANNOUNCE_EVERY, Form};
 use crate::{VerbOptions, key_file, now};

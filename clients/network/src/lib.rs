@@ -10,14 +10,16 @@ use scanhub_shm::{Domain, Environment};
 
 mod forward;
 mod gateway;
+mod gateway_identity;
 mod interface;
 mod key_file;
 pub mod lan;
 mod listen;
 mod reception;
 
-pub use forward::{Carrier, Forwarder, Life, Selection, account, begin_life, tell};
+pub use forward::{Carrier, Forwarder, Selection, account, tell};
 pub use gateway::{GatewayArgs, groups_help};
+pub use gateway_identity::{Life, begin_life};
 pub use key_file::KeyArgs;
 pub use listen::{LISTEN_SIGNALS, ListenArgs};
 pub use reception::{Origin, Reception, Wanted, Words, received_topics};

@@ -10,7 +10,8 @@ use scanhub_schema::{Failure, Kind, Topic};
 
 use super::udp_destination::UdpDestination;
 use super::uplink::Uplink;
-use crate::forward::{Carrier, Life};
+use crate::forward::Carrier;
+use crate::gateway_identity::Life;
 use crate::now;
 
 /// What goes out, and the account of it.

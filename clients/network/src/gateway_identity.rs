@@ -1,5 +1,5 @@
-//! Who a gateway is: a random number that it keeps from one start to the next, and the number of this life, greater than
-//! those before. Two gateways at once are two, also those of one hub. Refuses to know what is sent under them.
+//! Identity of a gateway: a random number that it keeps from one start to the next, and an epoch that is greater than those
+//! of earlier runs. Two gateways of one hub have different numbers.
 
 use std::fs::{File, Permissions};
 use std::hash::{BuildHasher, RandomState};
@@ -7,32 +7,34 @@ use std::io;
 use std::os::unix::fs::{FileExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use scanhub_client::clock;
+use scanhub_files::regular;
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Directory, StateDirectory};
 
-/// One life of a gateway. Nobody else has its number as long as this value is there.
+/// Identity of a gateway in one run. No other process has its number while this value exists.
 #[derive(Debug)]
 pub struct Life {
-    /// The gateway.
+    /// Number of the gateway.
     pub hub: u64,
     /// Seconds since 1970 at its start, or one more than the last epoch of it.
     pub epoch: u32,
-    /// The number that was kept was another machine's, of whose disk this one's is a copy: this gateway drew its own.
+    /// Whether the gateway has a new number, because the kept one belongs to another machine whose disk was copied.
     pub is_renumbered: bool,
     /// Locked.
     _file: File,
 }
 
 impl Life {
-    /// Begins a life of the gateway of `domain` on `interface` (or another word for where it sends), or of another one if
-    /// there is one already: kept in a file in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
-    /// What was kept on another `machine` than this one is another gateway's; where that is not known, it is not asked.
+    /// Begins a run of the gateway of `domain` on `interface` (or another word for its destination), or of another one if that
+    /// one is running. The number is kept in a file in `directory`, which is created if it does not exist. `now_s` is seconds
+    /// since 1970. A number that was kept on another `machine`, if that is known, belongs to another gateway.
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if the file cannot be written: then listeners could not distinguish this run from the last one.
-    /// [`Kind::Configuration`] if there are too many.
-    pub(super) fn begin(
+    /// Returns [`Kind::Output`] if the file cannot be written, because listeners could not distinguish this run from the last
+    /// one, and [`Kind::Configuration`] if too many are running.
+    fn begin(
         directory: &Path,
         domain: &str,
         interface: &str,
@@ -44,7 +46,7 @@ impl Life {
             Failure { kind: Kind::Output, message, ..failure }
         };
         let place = Directory::make_state(directory, 1).map_err(unkept)?;
-        for number in 1..=MOST {
+        for number in 1..=MAX_GATEWAYS {
             let name = format!("gateway-{domain}-{interface}-{number}");
             let file = place.file_or_new(&name).map_err(unkept)?;
             let unusable = |error: io::Error| {
@@ -57,7 +59,7 @@ impl Life {
                 Err(std::fs::TryLockError::Error(error)) => return Err(unusable(error)),
             }
         }
-        let what = format!("{MOST} gateways of domain {domain} are on {interface} already");
+        let what = format!("{MAX_GATEWAYS} gateways of domain {domain} are on {interface} already");
         Err(Failure::new(Kind::Configuration, what, "stop some of them"))
     }
 
@@ -67,7 +69,7 @@ impl Life {
         let is_copy =
             |kept: &Kept| kept.machine.is_some_and(|there| machine.is_some_and(|here| here != there));
         let is_renumbered = kept.as_ref().is_some_and(is_copy);
-        // What is no such line, or has no next epoch, is as good as nothing: another gateway.
+        // An invalid line, or one without a next epoch, makes it another gateway.
         let last = kept.filter(|kept| !is_copy(kept)).and_then(|kept| {
             let epoch = kept.epoch.checked_add(1)?.max(now);
             Some(Kept { epoch, machine: machine.or(kept.machine), ..kept })
@@ -84,7 +86,7 @@ impl Life {
     }
 }
 
-/// What the file says: 16 hex digits, 10 digits, and 16 hex digits for the machine if that is known.
+/// Content of the file: 16 hex digits, 10 digits, and 16 hex digits for the machine if that is known.
 struct Kept {
     hub: u64,
     epoch: u32,
@@ -109,18 +111,48 @@ impl Kept {
     }
 }
 
-/// Where such files are: beside the directories of domains.
+/// Returns the directory of these files, next to those of domains.
 ///
-/// [`Kind::Configuration`] if the environment names no place.
-pub(super) fn directory() -> Result<PathBuf, Failure> {
+/// # Errors
+///
+/// Returns [`Kind::Configuration`] if the environment names none.
+fn directory() -> Result<PathBuf, Failure> {
     StateDirectory::base().ok_or_else(|| {
         let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
         Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
     })
 }
 
-/// Gateways of one domain on one interface: more are started by mistake.
-const MOST: u32 = 16;
+/// Maximum number of gateways of one domain on one interface. More are started by mistake.
+const MAX_GATEWAYS: u32 = 16;
+
+/// Begins a run of the gateway of `domain` by this `way`, on this machine and now.
+///
+/// # Errors
+///
+/// Returns the same errors as `Life::begin`, and [`Kind::Configuration`] if the environment names no directory for its number.
+pub fn begin_life(domain: &str, way: &str) -> Result<Life, Failure> {
+    let now_s = clock::wall_ns() / 1_000_000_000;
+    Life::begin(&directory()?, domain, way, now_s, machine(Path::new(MACHINE_ID)))
+}
+
+/// Returns a number that identifies this machine, a hash of its ID because the ID itself is confidential (machine-id(5)). `None`
+/// if the file at `path` is missing or contains no such ID.
+fn machine(path: &Path) -> Option<u64> {
+    let text = regular::read_text(path, regular::LONGEST).ok()?;
+    let id = text.trim_end();
+    let is_id = id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit());
+    is_id.then(|| hash(id))
+}
+
+/// File with the ID of this machine.
+const MACHINE_ID: &str = "/etc/machine-id";
+
+/// FNV-1a, because the hash is compared with those of other builds.
+fn hash(id: &str) -> u64 {
+    let bytes = "scanhub gateway ".bytes().chain(id.bytes());
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3))
+}
 
 #[cfg(test)]
 mod tests {
@@ -202,5 +234,26 @@ mod tests {
         let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
         assert_eq!(refused.kind, Kind::Output);
         assert!(refused.message.contains("number: /dev/null: "), "{refused}");
+    }
+
+    #[test]
+    fn machine_id_is_always_the_same_number() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("machine-id");
+        let of = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            machine(&path)
+        };
+        let id = "0123456789abcdef0123456789abcdef";
+        assert_eq!(
+            (of(id), of(&format!("{id}\n"))),
+            (Some(0x8f5c_2224_2b82_b25b), Some(0x8f5c_2224_2b82_b25b))
+        );
+        assert_ne!(of("0123456789abcdef0123456789abcdee\n"), of(id));
+        assert!(
+            ["", "uninitialized\n", "x123456789abcdef0123456789abcdef\n"].iter().all(|no| of(no).is_none())
+        );
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(machine(&path), None);
     }
 }
