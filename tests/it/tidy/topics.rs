@@ -25,7 +25,7 @@ const ALSO: [&str; 3] = [
     "hub/preprocess/",
     "hub/daemon/src/pipeline.rs",
     // A gateway sends it only on request.
-    "clients/verbs/src/forward/selection.rs",
+    "clients/network/src/forward/selection.rs",
 ];
 
 /// Product files that name the topic, and are neither pages nor generated. The Python package reads shared memory on its own.

@@ -101,6 +101,8 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
         ("request", Request::Stop.encode(0).bytes().to_vec(), "no telegram in it"),
         ("poses.log", b"PARAM a b\nODOM 0 0 0 0 0 0 1.5 host 1.5\n".to_vec(), "without a scan"),
         ("wrong.log", b"PARAM a b\nFLASER 12 1 2\n".to_vec(), "wrong.log:2: 12 beams"),
+        #[cfg(not(feature = "mcap"))]
+        ("a.mcap", b"\x89MCAP0\r\nmore".to_vec(), "which this build does not read"),
         ("cut.gz", gzip(&scan(7))[..40].to_vec(), "cannot read"),
     ] {
         let file = temporary(name, &bytes);

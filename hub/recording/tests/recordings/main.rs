@@ -1,15 +1,23 @@
 //! Recordings as files: one binary with a module for each thing that is held, so that what they all link is linked once.
 
+#[cfg(feature = "mcap")]
 mod folder;
 #[path = "../../../../tests/testkit/skip.rs"]
 mod skip;
+#[cfg(feature = "mcap")]
 mod written;
 
+#[cfg(feature = "mcap")]
 mod convert;
+#[cfg(feature = "mcap")]
 mod damaged;
 mod files;
+#[cfg(feature = "mcap")]
 mod hostile;
+#[cfg(feature = "mcap")]
 mod logs;
+#[cfg(feature = "mcap")]
 mod mcap;
 mod real;
+#[cfg(feature = "mcap")]
 mod version_1;
