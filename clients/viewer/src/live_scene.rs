@@ -1,13 +1,13 @@
 //! The scene of a running hub, as `watch` and `web` follow it: which topics, how samples and notices change the scene,
-//! and the CPU time of the hub.
+//! the join of each scan with its foreground, and the CPU time of the hub.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::Sample;
+use scanhub_client::streams::{Join, Sample};
 use scanhub_client::{clock, live_topics};
-use scanhub_schema::{Maker, Topic};
+use scanhub_schema::{Foreground, Header, Maker, Scan, Topic};
 use scanhub_shm::Domain;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::TopicName;
@@ -56,8 +56,16 @@ pub(crate) fn followed(
 #[derive(Default)]
 pub(crate) struct LiveScene {
     pub(crate) scene: Scene,
+    /// Scans and foregrounds of each sensor that wait for their partner.
+    joins: BTreeMap<String, Join<StampedScan, Box<Foreground>>>,
     cpu: CpuUsage,
 }
+
+type StampedScan = (Header, Box<Scan>);
+
+/// A scan with its header, and the foreground that the hub computed from the same telegram. The scene shows a scan at once,
+/// without its foreground. A trail needs both.
+pub(crate) type Pair = (StampedScan, Box<Foreground>);
 
 impl LiveScene {
     /// Adds the sensor of a link's topic that will be followed.
@@ -67,23 +75,56 @@ impl LiveScene {
         }
     }
 
-    /// Takes a `sample` of `name`.
-    pub(crate) fn take(&mut self, name: &TopicName, sample: &Sample) {
+    /// Takes a `sample` of `name`. Returns a scan and its foreground if the sample has completed them.
+    pub(crate) fn take(&mut self, name: &TopicName, sample: &Sample) -> Option<Pair> {
+        let now_ns = clock::now_ns();
         if let Sample::Tracks(tracks) = sample {
-            return self.scene.take_tracks(&name.sensor, tracks, clock::now_ns());
+            self.scene.take_tracks(&name.sensor, tracks, now_ns);
+            return None;
         }
         let sensor = self.scene.heard(&name.sensor, sample.header());
         match sample {
-            Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
+            Sample::Scan(scan) => return self.take_scan(&name.sensor, scan.header(), scan, now_ns),
+            Sample::Foreground(found) => {
+                return self.take_foreground(&name.sensor, found.header(), found, now_ns);
+            }
             Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
             Sample::Zones(heard) => sensor.zones = heard.zones,
-            Sample::Foreground(found) => sensor.take_foreground(found.header(), found, clock::now_ns()),
             Sample::Background(model) => sensor.background = Some(model.boxed()),
             Sample::Lines(lines) => sensor.lines = Some(Box::new(**lines)),
             Sample::Status(status) => sensor.take_status(status),
             // Not part of any picture.
             _ => {}
         }
+        None
+    }
+
+    fn take_scan(&mut self, sensor: &str, header: &Header, scan: &Scan, now_ns: u64) -> Option<Pair> {
+        self.scene.sensor(sensor).take_scan(header, scan, now_ns);
+        let pair = self.join(sensor).first(header, (*header, scan.boxed()), now_ns);
+        self.take_pair(sensor, pair, now_ns)
+    }
+
+    fn take_foreground(
+        &mut self,
+        sensor: &str,
+        header: &Header,
+        foreground: &Foreground,
+        now_ns: u64,
+    ) -> Option<Pair> {
+        self.scene.sensor(sensor).take_foreground(foreground);
+        let pair = self.join(sensor).second(header, foreground.boxed(), now_ns);
+        self.take_pair(sensor, pair, now_ns)
+    }
+
+    fn join(&mut self, sensor: &str) -> &mut Join<StampedScan, Box<Foreground>> {
+        self.joins.entry(sensor.to_owned()).or_default()
+    }
+
+    fn take_pair(&mut self, sensor: &str, pair: Option<Pair>, now_ns: u64) -> Option<Pair> {
+        let ((_, scan), foreground) = pair.as_ref()?;
+        self.scene.sensor(sensor).take_pair(scan, foreground, now_ns);
+        pair
     }
 
     /// Takes a notice about the streams of `names`.
@@ -92,7 +133,10 @@ impl LiveScene {
             (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
                 self.scene.sensor(&name.sensor).lost += *missed;
             }
-            (Notice::NoHub(_) | Notice::HubGone, _) => self.scene.hub_gone(),
+            (Notice::NoHub(_) | Notice::HubGone, _) => {
+                self.joins.clear();
+                self.scene.hub_gone();
+            }
             (Notice::HubBack, _) => self.scene.hub_lives = true,
             _ => {}
         }
@@ -100,7 +144,9 @@ impl LiveScene {
 
     /// Deletes data that is too old. Returns whether there was any.
     pub(crate) fn age(&mut self) -> bool {
-        self.scene.age(clock::now_ns())
+        let now_ns = clock::now_ns();
+        self.joins.values_mut().for_each(|join| join.expire(now_ns));
+        self.scene.age(now_ns)
     }
 
     /// Updates the CPU time of the hub. Returns whether it has changed.
@@ -163,6 +209,31 @@ const SAMPLES: usize = 6;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use scanhub_schema::{ForegroundHead, ScanHead, Status};
+
+    #[test]
+    fn scan_is_shown_at_once_and_leaves_a_trail_with_its_foreground() {
+        let mut live = LiveScene::default();
+        live.scene.sensor("front").take_status(&Status::default());
+        let header = |seq| Header { seq, ..Header::default() };
+        let scan = Scan::of(ScanHead::lms(9, 0, 1000, 1, 13), &[1000; 9]);
+        let mut found = Foreground::of(9);
+        found.begin(ForegroundHead { count: 9, ..ForegroundHead::default() }).bits[0] = 0b101;
+        let count = |live: &LiveScene| {
+            let sensor = &live.scene.sensors[0];
+            (sensor.points().count(), sensor.trail.points().count())
+        };
+        assert!(live.take_scan("front", &header(4), &scan, 0).is_none());
+        assert_eq!(count(&live), (9, 0));
+        assert!(live.take_foreground("front", &header(5), &found, 1).is_none());
+        assert_eq!(count(&live), (9, 0), "the foreground is of another telegram");
+        assert!(live.take_foreground("rear", &header(4), &found, 1).is_none(), "of another sensor");
+        let ((joined, _), _) = live.take_scan("front", &header(5), &scan, 2).expect("a pair");
+        assert_eq!((joined.seq, count(&live)), (5, (9, 2)));
+        live.take_scan("front", &header(6), &scan, 3);
+        live.note(&[], &Notice::HubGone);
+        assert!(live.take_foreground("front", &header(6), &found, 4).is_none(), "the hub has exited");
+    }
 
     #[test]
     fn measures_a_busy_process_and_no_other() {

@@ -39,10 +39,6 @@ pub struct Sensor {
     pub lost: u64,
     /// Highest intensity of the last minutes, in the sensor's units.
     brightest: f64,
-    /// `seq` of the last scan.
-    scan_seq: u64,
-    /// `seq` of the last foreground.
-    foreground_seq: u64,
     /// Time from which on the last scan is too old to be shown, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
     /// Flags in the header of the last scan.
@@ -72,28 +68,21 @@ impl Sensor {
         // The highest intensity fades over minutes, because colors that change quickly cannot be read.
         let brightest = scan.intensities().iter().max().map_or(1.0, f64::from);
         self.brightest = brightest.max(FADING * self.brightest).max(1.0);
-        self.scan_seq = header.seq;
         self.flags = header.flags;
-        self.leave_trail(now_ns);
     }
 
-    /// Takes the foreground of the scan with this `header`, which arrived at `now_ns`.
-    pub fn take_foreground(&mut self, header: &Header, foreground: &Foreground, now_ns: u64) {
+    /// Takes a foreground. It is drawn on the last scan, even if that scan comes from another telegram.
+    pub fn take_foreground(&mut self, foreground: &Foreground) {
         self.foreground = Some(foreground.boxed());
-        self.foreground_seq = header.seq;
-        self.leave_trail(now_ns);
     }
 
-    /// Adds a step to the trail once both scan and foreground of one telegram have arrived.
-    fn leave_trail(&mut self, now_ns: u64) {
-        if self.scan_seq == self.foreground_seq && self.foreground.is_some() {
-            let mut trail = std::mem::take(&mut self.trail);
-            trail.take(now_ns, || {
-                let seen = self.points().filter(|point| point.is_foreground);
-                seen.map(|point| (point.x_m, point.y_m)).collect()
-            });
-            self.trail = trail;
-        }
+    /// Adds a step to the trail, from a scan and its foreground that are complete since `now_ns`.
+    pub fn take_pair(&mut self, scan: &Scan, foreground: &Foreground, now_ns: u64) {
+        let Some(pose) = self.placement.pose() else { return };
+        self.trail.take(now_ns, || {
+            let seen = points(scan, Some(foreground), pose).filter(|point| point.is_foreground);
+            seen.map(|point| (point.x_m, point.y_m)).collect()
+        });
     }
 
     /// Takes the status of the sensor's link, which has its pose on the robot.
@@ -154,14 +143,7 @@ impl Sensor {
     /// Returns the points of the last scan, in the frame of the picture.
     pub fn points(&self) -> impl Iterator<Item = Point> {
         let placed = self.scan.iter().zip(self.placement.pose());
-        placed.flat_map(move |(scan, pose)| {
-            (0..scan.beams()).filter_map(move |beam| {
-                let (x_m, y_m) = point_m(&pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
-                let is_foreground =
-                    self.foreground.as_ref().is_some_and(|foreground| foreground.contains(beam));
-                Some(Point { x_m, y_m, beam, intensity: scan.intensities().get(beam), is_foreground })
-            })
-        })
+        placed.flat_map(|(scan, pose)| points(scan, self.foreground.as_deref(), pose))
     }
 
     /// Returns the marks of the last scan, in meters in the frame of the picture.
@@ -188,6 +170,15 @@ impl Sensor {
     pub fn lines(&self) -> Option<&Lines> {
         self.lines.as_deref().filter(|_| !self.placement.is_in_map())
     }
+}
+
+/// Returns the points of `scan`, measured at `pose` in the frame of the picture.
+fn points(scan: &Scan, foreground: Option<&Foreground>, pose: Pose) -> impl Iterator<Item = Point> {
+    (0..scan.beams()).filter_map(move |beam| {
+        let (x_m, y_m) = point_m(&pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
+        let is_foreground = foreground.is_some_and(|foreground| foreground.contains(beam));
+        Some(Point { x_m, y_m, beam, intensity: scan.intensities().get(beam), is_foreground })
+    })
 }
 
 /// Position of a sensor in the picture.
@@ -348,19 +339,24 @@ mod tests {
     use scanhub_schema::{ForegroundHead, ScanHead};
 
     #[test]
-    fn scan_and_foreground_with_the_same_seq_leave_a_trail_and_shades_follow_the_brightest_point() {
+    fn pair_leaves_a_trail_and_shades_follow_the_brightest_point() {
         let mut sensor = Sensor::new("front");
-        let header = |seq| Header { seq, ..Header::default() };
         let scan = Scan::of(ScanHead::lms(9, 0, 1000, 1, 13), &[1000; 9]);
         let mut found = Foreground::of(9);
         found.begin(ForegroundHead { count: 9, ..ForegroundHead::default() }).bits[0] = 0b101;
-        sensor.take_scan(&header(4), &scan, 0);
-        assert_eq!(sensor.points().count(), 0, "its pose is unknown");
+        sensor.take_scan(&Header::default(), &scan, 0);
+        sensor.take_pair(&scan, &found, 0);
+        assert_eq!((sensor.points().count(), sensor.trail.points().count()), (0, 0), "its pose is unknown");
         sensor.take_status(&Status::default());
-        assert_eq!(sensor.points().count(), 9);
-        sensor.take_foreground(&header(5), &found, 1);
-        assert_eq!(sensor.trail.points().count(), 0, "of another telegram");
-        sensor.take_scan(&header(5), &scan, 2);
+        let drawn = |sensor: &Sensor| sensor.points().filter(|point| point.is_foreground).count();
+        assert_eq!(
+            (sensor.points().count(), drawn(&sensor)),
+            (9, 0),
+            "a scan is drawn without its foreground"
+        );
+        sensor.take_foreground(&found);
+        assert_eq!((drawn(&sensor), sensor.trail.points().count()), (2, 0));
+        sensor.take_pair(&scan, &found, 2);
         assert_eq!(sensor.trail.points().count(), 2);
         assert_eq!(
             (sensor.shade(0), sensor.shade(1), sensor.shade(9)),

@@ -429,7 +429,8 @@ fn colors_show_intensities_and_trails() {
     let header = |seq| Header { seq, ..Header::default() };
     sensor.take_status(&Status::default());
     sensor.take_scan(&header(1), &scan, 0);
-    sensor.take_foreground(&header(1), &found, 0);
+    sensor.take_foreground(&found);
+    sensor.take_pair(&scan, &found, 0);
     let inks = |view: &View| {
         let screen = screen(&scene, view, (120, 40));
         [Color::Blue, Color::Cyan, Color::Green, Color::Yellow, Color::Magenta, Color::LightMagenta]

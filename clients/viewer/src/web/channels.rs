@@ -7,6 +7,7 @@ use scanhub_client::streams::Sample;
 use scanhub_schema::{Background, Header, Maker, Scan, SweepPoints, Topic};
 use scanhub_verbs::names::TopicName;
 
+use crate::live_scene::Pair;
 use crate::scene::Sensor;
 use crate::server::{ChannelPublisher, ChannelStore, messages};
 
@@ -17,10 +18,6 @@ pub(super) struct SensorChannels<'a> {
     foreground: ChannelPublisher<'a>,
     background: ChannelPublisher<'a>,
     status: ChannelPublisher<'a>,
-    /// Header of the last scan.
-    scan_header: Option<Header>,
-    /// `seq` of the last foreground, until it is published.
-    foreground_seq: Option<u64>,
     /// Memory for messages.
     message: Vec<u8>,
 }
@@ -33,15 +30,12 @@ impl<'a> SensorChannels<'a> {
             foreground: channels.open(messages::foreground_channel(sensor)),
             background: channels.open(messages::background_channel(sensor)),
             status: channels.open(messages::status_channel(sensor)),
-            scan_header: None,
-            foreground_seq: None,
             message: Vec::new(),
         }
     }
 
     /// Publishes a scan.
     pub(super) fn publish_scan(&mut self, header: &Header, scan: &Scan) {
-        self.scan_header = Some(*header);
         if self.scan.is_wanted() {
             self.message.clear();
             scanhub_ros::laser_scan(&mut self.message, scanhub_ros::frame(&self.sensor), header, scan);
@@ -49,23 +43,12 @@ impl<'a> SensorChannels<'a> {
         }
     }
 
-    /// Notes that a foreground with this `seq` has arrived.
-    pub(super) fn take_foreground(&mut self, seq: u64) {
-        self.foreground_seq = Some(seq);
-    }
-
-    /// Publishes the foreground of `seen` once the scan with the same `seq` has arrived, which has the angles of the
-    /// beams.
-    pub(super) fn publish_foreground(&mut self, seen: &Sensor) {
-        let Some(header) = self.scan_header.filter(|header| self.foreground_seq == Some(header.seq)) else {
-            return;
-        };
-        self.foreground_seq = None;
-        let (Some(scan), Some(foreground)) = (&seen.scan, &seen.foreground) else { return };
+    /// Publishes a foreground. Its scan has the angles of the beams.
+    pub(super) fn publish_foreground(&mut self, ((header, scan), foreground): &Pair) {
         if self.foreground.is_wanted() {
             let (message, frame) = (&mut self.message, scanhub_ros::frame(&self.sensor));
             message.clear();
-            scanhub_ros::foreground_cloud(message, frame, &header, scan, foreground);
+            scanhub_ros::foreground_cloud(message, frame, header, scan, foreground);
             self.foreground.publish(header.wall_ns, message);
         }
     }

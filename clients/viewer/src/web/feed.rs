@@ -151,28 +151,23 @@ impl Feed<'_> {
         // Only these topics have poses.
         let has_poses = matches!(sample, Sample::Tracks(_) | Sample::Status(_));
         let before = if has_poses { placements(&self.live.scene) } else { Vec::new() };
-        self.live.take(name, sample);
+        let pair = self.live.take(name, sample);
         self.sensors.are_poses_new |= has_poses && placements(&self.live.scene) != before;
         if let Sample::Tracks(tracks) = sample {
             return self.publish_people(&name.sensor, tracks.header().wall_ns);
         }
-        let seen = self.live.scene.sensor(&name.sensor);
         let sensor = self.sensors.channels_of(&name.sensor);
         match sample {
-            Sample::Scan(scan) => {
-                sensor.publish_scan(scan.header(), scan);
-                sensor.publish_foreground(seen);
-            }
-            Sample::Foreground(foreground) => {
-                sensor.take_foreground(foreground.header().seq);
-                sensor.publish_foreground(seen);
-            }
+            Sample::Scan(scan) => sensor.publish_scan(scan.header(), scan),
             Sample::Background(model) => sensor.publish_background(model.header().wall_ns, model),
             Sample::Status(_) => self.sensors.publish_at = Instant::now(),
             Sample::Zones(_) => self.overlays.zones.is_new = true,
             Sample::Marks(_) => self.overlays.marks.is_new = true,
             Sample::Lines(_) => self.overlays.lines.is_new = true,
             _ => {}
+        }
+        if let Some(pair) = pair {
+            self.sensors.channels_of(&name.sensor).publish_foreground(&pair);
         }
     }
 
