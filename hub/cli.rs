@@ -11,7 +11,6 @@ mod doctor;
 mod examples;
 mod gateway;
 mod generated;
-mod latency;
 mod leds;
 mod probe;
 pub(crate) mod record;
@@ -42,7 +41,6 @@ pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
-pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
@@ -152,8 +150,7 @@ pub(crate) enum Verb {
     /// Measure rate, jitter and loss of topics
     Hz(Hz),
     /// Measure how old samples are on arrival, split into line, hub and wake-up: percentiles
-    #[command(after_help = latency::SPANS)]
-    Latency(Latency),
+    Latency(scanhub_verbs::LatencyArgs),
     /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
     Watch(scanhub_viewer::WatchArgs),
     /// Serve the live picture to browsers, and to Foxglove and Lichtblick

@@ -9,7 +9,7 @@ mod replay;
 
 use std::ffi::c_int;
 use std::fs::File;
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
@@ -142,7 +142,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             scanhub_verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Latency(latency) => {
-            scanhub_verbs::latency(&latency.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+            let is_terminal = out.is_terminal();
+            latency.run(json, is_terminal, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?)
         }
         // Every signal that ends it must restore the terminal.
         Verb::Watch(watch) => {

@@ -1,96 +1,117 @@
-//! `scanhub latency`: how old samples are when they are received here, and where they spent that time. The figures are
-//! those of any consumer of the client library that waits in the same way.
+//! `scanhub latency`: measures how old samples are on arrival, and in which span that time passed. Other programs measure
+//! the same if they use the client library and wait in the same way.
 
-mod ages;
-mod grain;
-mod realtime;
-mod report;
+mod conditions;
 mod spans;
 
-use std::io::Write;
+use std::io::{self, Write};
 use std::sync::atomic::AtomicBool;
-use std::thread;
 use std::time::{Duration, Instant};
 
+use clap::{Args, ValueEnum};
 use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Flags, Kind};
 use scanhub_shm::Domain;
+use serde::Serialize;
 
+use self::conditions::Conditions;
+use self::spans::{Quantiles, Span, Spans};
 use crate::follow::{Arrival, Bounds, Event, Following, Notice};
 use crate::names::TopicName;
-use crate::output::{End, Output, quiet};
+use crate::output::{End, Output, quiet, table};
 use crate::receive_stats::ReceiveStats;
-use crate::{json, text};
-use realtime::Realtime;
-use report::{Conditions, NOTHING_CAME, why_nothing};
-use spans::{Span, Spans};
+use crate::{duration, json, text};
 
-/// What `latency` is asked for.
-#[derive(Clone, Debug)]
-pub struct LatencyOptions {
-    /// `SENSOR/TOPIC`, at least one.
-    pub topics: Vec<String>,
-    /// Objects instead of text.
-    pub json: bool,
-    /// Somebody looks at the text: bars beside the numbers.
-    pub terminal: bool,
-    /// How it waits for samples.
-    pub wait: Wait,
-    /// Real-time priority and locked memory if they are permitted; the calling thread and its process keep them.
-    pub realtime: bool,
-    /// The greatest age on arrival that 99 of 100 samples of each topic may have.
-    pub max_p99: Option<Duration>,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `latency`.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = SPANS)]
+pub struct LatencyArgs {
+    /// Topics to follow: front/scan, rear/telegram, robot1.front/zones ..
+    #[arg(required = true, value_name = "SENSOR/TOPIC")]
+    topics: Vec<String>,
+    /// Exit with 5 if more than one in a hundred samples of a topic is older on arrival, for example 1ms
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    max_p99: Option<Duration>,
+    /// How to wait for samples
+    #[arg(long, value_enum, default_value = "doorbell")]
+    wait: WaitBy,
+    /// Do not ask for real-time priority and locked memory
+    #[arg(long)]
+    no_realtime: bool,
+    #[command(flatten)]
+    bounds: Bounds,
 }
 
-/// Writes the conditions, a line per topic and second, and at the end what came of each topic, to `out`; conditions and
-/// notices to `notes` (stderr) if `out` is not JSON. Each line is of the whole run so far.
-///
-/// [`Kind::Check`] if a topic is older than `max_p99` permits, or its age is not known; else as [`echo`](crate::echo()).
-pub fn latency(
-    options: &LatencyOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let mut names: Vec<TopicName> = Vec::new();
-    for text in &options.topics {
-        let name = TopicName::parse(text)?;
-        if !names.contains(&name) {
-            names.push(name);
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum WaitBy {
+    /// Sleep on a word in shared memory; one call of the hub wakes all
+    Doorbell,
+    /// Sleep on the event; the hub sends one message to each consumer
+    Event,
+    /// Do not sleep; uses a whole processor
+    Spin,
+}
+
+const SPANS: &str = "line: first byte to last; network: a remote sensor's first byte to the arrival on this \
+machine, by the wall clocks of both; hub: last byte until sent; wake: sent until received; age: last byte, or arrival on \
+this machine, until received, which --max-p99 checks; total: all of it\n\n\
+To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p99 1ms";
+
+/// Interval between two lines of a topic.
+const LINE_INTERVAL: Duration = Duration::from_secs(1);
+
+impl LatencyArgs {
+    /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end to `out`. Each line
+    /// covers the run so far. Without `json`, conditions and notices go to `notes` (stderr). The result has bars if
+    /// `is_terminal`.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Check`] if a topic is older than `--max-p99` permits, or its age is unknown.
+    /// - The errors of [`echo`](crate::echo()).
+    pub fn run(
+        &self,
+        json: bool,
+        is_terminal: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let mut names: Vec<TopicName> = Vec::new();
+        for text in &self.topics {
+            let name = TopicName::parse(text)?;
+            if !names.contains(&name) {
+                names.push(name);
+            }
         }
+        let wait = match self.wait {
+            WaitBy::Doorbell => Wait::Doorbell,
+            WaitBy::Event => Wait::Event,
+            WaitBy::Spin => Wait::Spin,
+        };
+        let mut latency = Latency {
+            is_json: json,
+            is_terminal,
+            topics: names.iter().map(|name| (name.clone(), Spans::new())).collect(),
+            next: Instant::now() + LINE_INTERVAL,
+            out: Output::new(out),
+            notes: Output::new(notes),
+        };
+        let written = latency.conditions(&Conditions::take(wait, !self.no_realtime));
+        let mut following = Following::new(&names, &[], places, &self.bounds, stop).closely(wait);
+        let end = written.and_then(|()| {
+            let end = latency.run(&mut following);
+            following.finish(end, |name, stats| latency.summary(name, stats))
+        });
+        quiet(end.and_then(|()| self.max_p99.map_or(Ok(()), |limit| Ok(latency.check(limit)?))))
     }
-    let mut latency = Latency {
-        json: options.json,
-        terminal: options.terminal,
-        topics: names.iter().map(|name| (name.clone(), Spans::new())).collect(),
-        next: Instant::now() + EVERY,
-        out: Output::new(out),
-        notes: Output::new(notes),
-    };
-    let processors = thread::available_parallelism().map_or(1, usize::from);
-    let realtime =
-        if options.realtime { Realtime::take(options.wait, processors) } else { Realtime::default() };
-    let conditions = Conditions::new(options.wait, &realtime, grain::grain());
-    let told = latency.tell(&conditions);
-    let following = Following::new(&names, &[], &options.places, &options.bounds, stop);
-    let mut following = following.closely(options.wait);
-    let end = told.and_then(|()| {
-        let end = latency.run(&mut following);
-        following.finish(end, |name, stats| latency.summary(name, stats))
-    });
-    quiet(end.and_then(|()| options.max_p99.map_or(Ok(()), |limit| Ok(latency.judge(limit)?))))
 }
-
-const EVERY: Duration = Duration::from_secs(1);
 
 struct Latency<'a> {
-    json: bool,
-    terminal: bool,
+    is_json: bool,
+    is_terminal: bool,
     topics: Vec<(TopicName, Spans)>,
     next: Instant,
     out: Output<'a>,
@@ -98,11 +119,11 @@ struct Latency<'a> {
 }
 
 impl Latency<'_> {
-    fn tell(&mut self, conditions: &Conditions<'_>) -> Result<(), End> {
-        if self.json { self.out.json(conditions) } else { conditions.text(&mut self.notes) }
+    fn conditions(&mut self, conditions: &Conditions) -> Result<(), End> {
+        if self.is_json { self.out.json(conditions) } else { conditions.text(&mut self.notes) }
     }
 
-    fn judge(&self, limit: Duration) -> Result<(), Failure> {
+    fn check(&self, limit: Duration) -> Result<(), Failure> {
         for (name, spans) in &self.topics {
             let Some(age) = spans.ages(Span::Age).quantiles() else {
                 if spans.received == 0 {
@@ -138,11 +159,11 @@ impl Latency<'_> {
                 Event::Sample(name, sample, arrival) => self.sample(&name, &sample, arrival),
                 Event::Notice(names, notice) => {
                     if notice == Notice::HubBack {
-                        // Samples that the new hub sent before this moment waited for the verb.
+                        // Samples that the new hub sent before this moment waited for this process.
                         let now_ns = clock::now_ns();
                         self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
                     }
-                    notice.tell(&names, self.json, &mut self.out, &mut self.notes)?;
+                    notice.tell(&names, self.is_json, &mut self.out, &mut self.notes)?;
                 }
                 Event::Tick(now) => self.tick(now)?,
                 Event::Begun(_) | Event::Short(..) | Event::Line(..) => {}
@@ -166,13 +187,13 @@ impl Latency<'_> {
             return Ok(());
         }
         while self.next <= now {
-            self.next += EVERY;
+            self.next += LINE_INTERVAL;
         }
         for (name, spans) in &self.topics {
-            if self.json {
-                self.out.json(&report::json(name, spans))?;
+            if self.is_json {
+                self.out.json(&result(name, spans))?;
             } else {
-                self.out.line(|line| report::brief(line, name, spans))?;
+                self.out.line(|line| brief(line, name, spans))?;
             }
         }
         Ok(())
@@ -180,11 +201,225 @@ impl Latency<'_> {
 
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         let Some((_, spans)) = self.topics.iter().find(|(known, _)| known == name) else { return Ok(()) };
-        if self.json {
-            self.out.json(&report::json(name, spans))?;
+        if self.is_json {
+            self.out.json(&result(name, spans))?;
             return self.out.json(&json::summary(name, stats));
         }
         self.out.line(|line| text::summary(line, name, stats))?;
-        report::full(&mut self.out, name, spans, self.terminal)
+        full(&mut self.out, name, spans, self.is_terminal)
+    }
+}
+
+/// Returns the line of class `latency`. A span without a known time is null. The keys are a contract: add, never change.
+fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        topic: &'static str,
+        received: u64,
+        before: u64,
+        ahead: u64,
+        flags: Vec<&'static str>,
+        age: Option<Quantiles>,
+        line: Option<Quantiles>,
+        hub: Option<Quantiles>,
+        wake: Option<Quantiles>,
+        total: Option<Quantiles>,
+        network: Option<Quantiles>,
+    }
+    let of = |span| spans.ages(span).quantiles();
+    Line {
+        class: "latency",
+        sensor: &name.sensor,
+        topic: name.topic.name(),
+        received: spans.received,
+        before: spans.before,
+        ahead: spans.ahead,
+        flags: Flags::names(spans.flags).collect(),
+        age: of(Span::Age),
+        line: of(Span::Line),
+        hub: of(Span::Hub),
+        wake: of(Span::Wake),
+        total: of(Span::Total),
+        network: of(Span::Network),
+    }
+}
+
+/// Writes the age of a topic so far in one line.
+fn brief(line: &mut Vec<u8>, name: &TopicName, spans: &Spans) -> io::Result<()> {
+    let topic = name.to_string();
+    match spans.ages(Span::Age).quantiles() {
+        Some(age) => write!(
+            line,
+            "{topic:<16} {:>7} age p50 {:>9} p99 {:>9} max {:>9} us",
+            age.count,
+            us(age.p50_ns),
+            us(age.p99_ns),
+            us(age.max_ns)
+        ),
+        None if spans.received == 0 => {
+            write!(line, "{topic:<16}       - age, {NOTHING_CAME}; {}", why_nothing(name))
+        }
+        None => write!(line, "{topic:<16}       - age, {} received", spans.received),
+    }
+}
+
+/// Writes the result of a topic: a row for each span with a known time, and the ages as bars if `has_bars`.
+fn full(out: &mut Output<'_>, name: &TopicName, spans: &Spans, has_bars: bool) -> Result<(), End> {
+    let heads = ["us", "count", "min", "p50", "p90", "p99", "p99.9", "max"].map(str::to_owned).to_vec();
+    let row = |span: Span| {
+        let Quantiles { count, min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns } =
+            spans.ages(span).quantiles()?;
+        let times = [min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns].map(us);
+        Some([vec![span.name().to_owned(), count.to_string()], times.to_vec()].concat())
+    };
+    let rows: Vec<_> = Span::ALL.into_iter().filter_map(row).collect();
+    if !rows.is_empty() {
+        table(out, &[vec![heads], rows].concat())?;
+    }
+    if has_bars {
+        bars(out, spans)?;
+    }
+    remarks(name, spans).iter().try_for_each(|remark| out.line(|line| write!(line, "{remark}")))
+}
+
+fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
+    let mut remarks = Vec::new();
+    if spans.received == 0 {
+        remarks.push(format!("{name}: {NOTHING_CAME}; {}", why_nothing(name)));
+    }
+    if spans.before > 0 {
+        let word = if spans.before == 1 { "was" } else { "were" };
+        remarks.push(format!("{name}: {} {word} sent before this listened, and left out", spans.before));
+    }
+    if spans.flags & Flags::REMOTE != 0 {
+        remarks.push(format!(
+            "{name}: the network's time is measured with the wall clocks of two machines, and contains their difference"
+        ));
+    }
+    if spans.ahead > 0 {
+        remarks
+            .push(format!("{name}: {} have stamps ahead of the clock here: the clocks differ", spans.ahead));
+    }
+    let kinds: Vec<_> = Flags::names(spans.flags).filter(|flag| *flag != "remote").collect();
+    if !kinds.is_empty() {
+        remarks.push(format!("{name}: {}", kinds.join(", ")));
+    }
+    remarks
+}
+
+const NOTHING_CAME: &str = "no sample arrived";
+
+fn why_nothing(name: &TopicName) -> String {
+    if name.is_robot() {
+        "`scanhub info` shows why".into()
+    } else {
+        format!("`scanhub info {}` shows why", name.sensor)
+    }
+}
+
+fn bars(out: &mut Output<'_>, spans: &Spans) -> Result<(), End> {
+    let bars = spans.ages(Span::Age).bars();
+    let most = bars.iter().map(|bar| bar.count).max().unwrap_or_default().max(1);
+    for bar in bars {
+        // Every bar that is not empty is visible.
+        let length = (bar.count * LONGEST_BAR).div_ceil(most) as usize;
+        out.line(|line| {
+            let (from, to) = (time(bar.from_ns), time(bar.to_ns));
+            write!(line, "{from:>7} .. {to:<7} {:>7}", bar.count)?;
+            if length > 0 { write!(line, " {}", "#".repeat(length)) } else { Ok(()) }
+        })?;
+    }
+    Ok(())
+}
+
+const LONGEST_BAR: u64 = 40;
+
+fn us(ns: u64) -> String {
+    format!("{:.1}", ns as f64 / 1e3)
+}
+
+/// Returns an edge between bars as a whole number of a unit.
+fn time(ns: u64) -> String {
+    match ns {
+        0..1_000_000 => format!("{} us", ns / 1_000),
+        1_000_000..1_000_000_000 => format!("{} ms", ns / 1_000_000),
+        _ => format!("{} s", ns / 1_000_000_000),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use scanhub_schema::Header;
+
+    use super::*;
+
+    fn measured() -> (TopicName, Spans) {
+        let mut spans = Spans::new();
+        spans.begin(1_000_000);
+        for (last_ns, age_ns) in
+            [(500_000, 700_000), (1_000_000, 1_500), (2_000_000, 1_600), (3_000_000, 15_000)]
+        {
+            let mut header =
+                Header { stamp_first_ns: 400_000, stamp_last_ns: last_ns, flags: 2, ..Header::default() };
+            header.set_sent_at(last_ns + 512);
+            spans.take(&header, Arrival { monotonic_ns: last_ns + age_ns, wall_ns: 0 });
+        }
+        (TopicName::parse("front/scan").expect("a topic"), spans)
+    }
+
+    #[test]
+    fn as_an_object() {
+        let (name, spans) = measured();
+        let line = serde_json::to_string(&result(&name, &spans)).expect("an object");
+        let begin = r#"{"class":"latency","sensor":"front","topic":"scan","received":4,"before":1,"ahead":0,"flags":["simulated"],"age":{"count":3,"min_ns":1500,"p50_ns":1600,"p90_ns":15000,"p99_ns":15000,"p999_ns":15000,"max_ns":15000},"line":{"count":3,"#;
+        assert!(line.starts_with(begin), "{line}");
+        assert!(line.contains(r#""hub":{"count":3,"min_ns":512,"p50_ns":512,"#), "{line}");
+        assert!(line.ends_with(r#","network":null}"#), "{line}");
+    }
+
+    #[test]
+    fn of_a_silence_it_is_said_where_the_reason_stands() {
+        for (topic, verb) in [("front/scan", "info front"), ("robot/zones", "info")] {
+            let (name, spans) = (TopicName::parse(topic).expect("a topic"), Spans::new());
+            let (mut line, mut text) = (Vec::new(), Vec::new());
+            brief(&mut line, &name, &spans).expect("written");
+            full(&mut Output::new(&mut text), &name, &spans, false).expect("written");
+            let why = format!("no sample arrived; `scanhub {verb}` shows why");
+            assert_eq!(String::from_utf8_lossy(&line), format!("{topic:<16}       - age, {why}"));
+            assert_eq!(String::from_utf8_lossy(&text), format!("{topic}: {why}\n"));
+        }
+    }
+
+    #[test]
+    fn as_a_table() {
+        let (name, spans) = measured();
+        let mut text = Vec::new();
+        full(&mut Output::new(&mut text), &name, &spans, true).expect("written");
+        let text = String::from_utf8(text).expect("text");
+        let expected = "\
+us     count  min    p50     p90     p99     p99.9   max
+line       3  600.0  1600.5  2600.0  2600.0  2600.0  2600.0
+hub        3    0.5     0.5     0.5     0.5     0.5     0.5
+wake       3    1.0     1.1    14.5    14.5    14.5    14.5
+age        3    1.5     1.6    15.0    15.0    15.0    15.0
+total      3  601.5  1602.6  2615.0  2615.0  2615.0  2615.0
+   1 us .. 2 us          2 ########################################
+   2 us .. 3 us          0
+   3 us .. 4 us          0
+   4 us .. 5 us          0
+   5 us .. 6 us          0
+   6 us .. 8 us          0
+   8 us .. 10 us         0
+  10 us .. 20 us         1 ####################
+front/scan: 1 was sent before this listened, and left out
+front/scan: simulated
+";
+        assert_eq!(text, expected);
+        let mut line = Vec::new();
+        brief(&mut line, &name, &spans).expect("written");
+        let line = String::from_utf8(line).expect("text");
+        assert_eq!(line, "front/scan             3 age p50       1.6 p99      15.0 max      15.0 us");
     }
 }

@@ -36,7 +36,7 @@ pub use follow::Bounds;
 pub use hz::{HzOptions, hz};
 pub use info::{InfoOptions, info};
 pub use json::error as error_line;
-pub use latency::{LatencyOptions, latency};
+pub use latency::LatencyArgs;
 pub use leds::{LedsLook, LedsOptions, leds};
 pub use list::{ListOptions, list, list_domains};
 pub use mask::{MaskOptions, mask};

@@ -1,34 +1,34 @@
-//! Divides the age of a sample, as far as its stamps allow: time on the line, in the hub, on the way to the consumer,
-//! on another machine. Time is an argument; refuses to know how samples arrive and how the result is shown.
+//! Splits the age of a sample into spans, as far as its stamps allow, and keeps a histogram of each span.
 
+use hdrhistogram::Histogram;
 use scanhub_schema::{Flags, Header};
+use serde::Serialize;
 
-use super::ages::Ages;
 use crate::follow::Arrival;
 
-/// A stretch of a sample's way.
+/// Part of the time between the first byte of a telegram and the arrival of its sample here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Span {
-    /// From the telegram's first byte to its last: the time on the line.
+    /// From the first byte of the telegram to its last: the time on the line.
     Line,
-    /// Of a sensor of another machine, from the first byte there to the arrival here: by the wall clocks of two machines.
+    /// From the first byte on another machine to the arrival on this one, by the wall clocks of both.
     Network,
     /// From the last byte until the hub sent it.
     Hub,
-    /// From when the hub sent it until it was received here.
+    /// From the time at which the hub sent it until it was received here.
     Wake,
-    /// The age on arrival: from the last byte, or from the arrival on this machine, until it was received here.
+    /// The age on arrival: from the last byte, or the arrival on this machine, until it was received here.
     Age,
     /// From the first byte until it was received here.
     Total,
 }
 
 impl Span {
-    /// In the order of a sample's way.
+    /// In the order of their times.
     pub(super) const ALL: [Span; 6] =
         [Span::Line, Span::Network, Span::Hub, Span::Wake, Span::Age, Span::Total];
 
-    /// As in all output.
+    /// Name in all output.
     pub(super) fn name(self) -> &'static str {
         match self {
             Span::Line => "line",
@@ -41,40 +41,38 @@ impl Span {
     }
 }
 
-/// The ages of one topic's samples.
+/// Spans of all samples of one topic.
 pub(super) struct Spans {
     /// Since when samples are received as they are sent.
     since_ns: u64,
     /// All samples.
     pub(super) received: u64,
-    /// Those that were sent before anybody waited for them here: what a topic keeps for late joiners, and the first of a
-    /// hub that was replaced.
+    /// Samples that were sent before this process waited for them: those that a topic keeps for late subscribers, and the
+    /// first ones of a new hub.
     pub(super) before: u64,
-    /// Stamps ahead of the clock here, from which no time follows: another machine's wall clock is not ours.
+    /// Samples with stamps ahead of the clock of this machine, for example by the wall clock of another one.
     pub(super) ahead: u64,
-    /// Bits of [`Flags`] that any of them had.
+    /// Bits of [`Flags`] that any sample had.
     pub(super) flags: u8,
     ages: [Ages; Span::ALL.len()],
 }
 
 impl Spans {
-    /// Nothing received yet.
     pub(super) fn new() -> Spans {
         let ages = Span::ALL.map(|_| Ages::new());
         Spans { since_ns: u64::MAX, received: 0, before: 0, ahead: 0, flags: 0, ages }
     }
 
-    /// What was sent before `now_ns` of CLOCK_MONOTONIC is not late if it comes after.
+    /// Does not measure samples that were sent before `now_ns` of CLOCK_MONOTONIC.
     pub(super) fn begin(&mut self, now_ns: u64) {
         self.since_ns = now_ns;
     }
 
-    /// The times of this stretch.
     pub(super) fn ages(&self, span: Span) -> &Ages {
         &self.ages[span as usize]
     }
 
-    /// A sample with `header` was received.
+    /// Takes the times of a sample that arrived at `seen`.
     pub(super) fn take(&mut self, header: &Header, seen: Arrival) {
         self.received += 1;
         self.flags |= header.flags;
@@ -88,7 +86,7 @@ impl Spans {
         };
         self.record(Span::Age, age_ns);
         if let Some(hub_ns) = header.hub_time_ns() {
-            // It is rounded up.
+            // The header contains it rounded up.
             let hub_ns = hub_ns.min(age_ns);
             self.record(Span::Hub, hub_ns);
             self.record(Span::Wake, age_ns - hub_ns);
@@ -96,14 +94,14 @@ impl Spans {
         if header.flags & Flags::REMOTE != 0 {
             let arrival_ns = seen.wall_ns.saturating_sub(age_ns);
             match arrival_ns.checked_sub(header.wall_ns) {
-                _ if arrival_ns.abs_diff(header.wall_ns) < OWN_WORD_NS => {}
+                _ if arrival_ns.abs_diff(header.wall_ns) < OWN_SAMPLE_NS => {}
                 Some(network_ns) => {
                     self.record(Span::Network, network_ns);
                     self.record(Span::Total, network_ns.saturating_add(age_ns));
                 }
                 None => self.ahead += 1,
             }
-        } else if is_of_bytes(header) {
+        } else if is_from_telegram(header) {
             let line_ns = header.stamp_last_ns - header.stamp_first_ns;
             self.record(Span::Line, line_ns);
             self.record(Span::Total, line_ns.saturating_add(age_ns));
@@ -115,13 +113,100 @@ impl Spans {
     }
 }
 
-/// What a listener says itself when it hears nothing is stamped by both clocks here, one after the other: it came over no
-/// network, which takes longer than that.
-const OWN_WORD_NS: u64 = 10_000;
+/// A listener that receives nothing publishes a sample of its own, stamped by both clocks of this machine one after the other.
+/// A network takes longer than this.
+const OWN_SAMPLE_NS: u64 = 10_000;
 
-/// Both stamps come from a telegram; they are equal in a sample that was published without one.
-fn is_of_bytes(header: &Header) -> bool {
+/// Returns whether both stamps come from a telegram. They are equal in a sample that was published without one.
+fn is_from_telegram(header: &Header) -> bool {
     header.flags & Flags::STAMP_ESTIMATED == 0 && header.stamp_first_ns < header.stamp_last_ns
+}
+
+/// Histogram of times up to 100 s, with three significant digits.
+pub(super) struct Ages {
+    histogram: Histogram<u64>,
+    min_ns: u64,
+    max_ns: u64,
+}
+
+/// Quantiles of times. Minimum and maximum are exact, the others are at most a thousandth too great.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Quantiles {
+    pub(super) count: u64,
+    pub(super) min_ns: u64,
+    pub(super) p50_ns: u64,
+    pub(super) p90_ns: u64,
+    pub(super) p99_ns: u64,
+    pub(super) p999_ns: u64,
+    pub(super) max_ns: u64,
+}
+
+/// Number of times in `from_ns..to_ns`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Bar {
+    pub(super) from_ns: u64,
+    pub(super) to_ns: u64,
+    pub(super) count: u64,
+}
+
+const LONGEST_NS: u64 = 100_000_000_000;
+const DIGITS: u8 = 3;
+
+impl Ages {
+    pub(super) fn new() -> Ages {
+        let histogram = Histogram::new_with_bounds(1, LONGEST_NS, DIGITS);
+        Ages { histogram: histogram.expect("bounds that a histogram can have"), min_ns: u64::MAX, max_ns: 0 }
+    }
+
+    pub(super) fn record(&mut self, ns: u64) {
+        self.histogram.saturating_record(ns);
+        self.min_ns = self.min_ns.min(ns);
+        self.max_ns = self.max_ns.max(ns);
+    }
+
+    /// Returns `None` if there are no times.
+    pub(super) fn quantiles(&self) -> Option<Quantiles> {
+        let (min_ns, max_ns) = (self.min_ns, self.max_ns);
+        let at = |quantile| self.histogram.value_at_quantile(quantile).clamp(min_ns, max_ns);
+        (!self.histogram.is_empty()).then(|| Quantiles {
+            count: self.histogram.len(),
+            min_ns,
+            p50_ns: at(0.5),
+            p90_ns: at(0.9),
+            p99_ns: at(0.99),
+            p999_ns: at(0.999),
+            max_ns,
+        })
+    }
+
+    /// Returns the bars from the minimum to the maximum, with the edges of [`STEPS`] and 0.
+    pub(super) fn bars(&self) -> Vec<Bar> {
+        let mut bars: Vec<Bar> = Vec::new();
+        let mut edges = edges();
+        let mut open = Bar { from_ns: 0, to_ns: edges.next().unwrap_or(LONGEST_NS), count: 0 };
+        for step in self.histogram.iter_recorded() {
+            while step.value_iterated_to() >= open.to_ns {
+                let next = Bar { from_ns: open.to_ns, to_ns: edges.next().unwrap_or(u64::MAX), count: 0 };
+                let full = std::mem::replace(&mut open, next);
+                if full.count > 0 || !bars.is_empty() {
+                    bars.push(full);
+                }
+            }
+            open.count += step.count_since_last_iteration();
+        }
+        if open.count > 0 {
+            bars.push(open);
+        }
+        bars
+    }
+}
+
+/// Edges between bars in each power of ten, from 1 us on.
+const STEPS: [u64; 7] = [1, 2, 3, 4, 5, 6, 8];
+
+fn edges() -> impl Iterator<Item = u64> {
+    let tens = std::iter::successors(Some(1_000_u64), |ten| Some(ten * 10));
+    tens.take_while(|ten| *ten < LONGEST_NS).flat_map(|ten| STEPS.map(|step| step * ten))
 }
 
 #[cfg(test)]
@@ -150,7 +235,7 @@ mod tests {
         spans
     }
 
-    /// Greatest time and count of each stretch that there is, in us.
+    /// Greatest time and count of each known span, in us.
     fn told(spans: &Spans) -> Vec<(&'static str, u64, u64)> {
         let told = |span: Span| {
             let quantiles = spans.ages(span).quantiles()?;
@@ -237,5 +322,46 @@ mod tests {
             spans.take(&remote(wall_ns), seen);
         }
         assert_eq!((spans.ahead, told(&spans)[0].2, told(&spans)[1].2), (1, 1, 4));
+    }
+
+    fn of(times: impl IntoIterator<Item = u64>) -> Ages {
+        let mut ages = Ages::new();
+        times.into_iter().for_each(|ns| ages.record(ns));
+        ages
+    }
+
+    #[test]
+    fn quantiles_of_a_thousand() {
+        assert_eq!(Ages::new().quantiles(), None);
+        let quantiles = of((1..=1000).rev()).quantiles().expect("a thousand");
+        let Quantiles { count, min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns } = quantiles;
+        assert_eq!(
+            (count, min_ns, p50_ns, p90_ns, p99_ns, p999_ns, max_ns),
+            (1000, 1, 500, 900, 990, 999, 1000)
+        );
+    }
+
+    #[test]
+    fn three_digits_are_kept_and_the_ends_as_they_are() {
+        for ns in [1_000, 72_345, 26_640_123, 99_000_000_000] {
+            let quantiles = of([ns - 1, ns, ns, ns + ns / 2]).quantiles().expect("four");
+            assert!((ns..=ns + ns / 1000).contains(&quantiles.p50_ns), "{ns}: {quantiles:?}");
+            assert_eq!((quantiles.min_ns, quantiles.max_ns), (ns - 1, ns + ns / 2));
+        }
+        let quantiles = of([5, u64::MAX]).quantiles().expect("two");
+        assert_eq!((quantiles.p50_ns, quantiles.max_ns), (5, u64::MAX));
+    }
+
+    #[test]
+    fn bars_hold_each_time_once() {
+        assert_eq!(Ages::new().bars(), []);
+        let bar =
+            |from_us: u64, to_us: u64, count| Bar { from_ns: from_us * 1000, to_ns: to_us * 1000, count };
+        let bars = of([25_000, 40_000, 49_000, 60_000, 150_000, 250_000]).bars();
+        assert_eq!(bars[..3], [bar(20, 30, 1), bar(30, 40, 0), bar(40, 50, 2)]);
+        assert_eq!(bars[3..6], [bar(50, 60, 0), bar(60, 80, 1), bar(80, 100, 0)]);
+        assert_eq!(bars[6..], [bar(100, 200, 1), bar(200, 300, 1)]);
+        assert_eq!(of([10]).bars(), [bar(0, 1, 1)]);
+        assert_eq!(of([u64::MAX, 3]).bars().iter().map(|bar| bar.count).sum::<u64>(), 2);
     }
 }

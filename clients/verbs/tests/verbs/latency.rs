@@ -2,32 +2,25 @@
 
 use std::time::Duration;
 
-use crate::fake::{FakeHub, Place, Verb};
-use scanhub_client::Wait;
+use clap::{Args, Command, FromArgMatches};
 use scanhub_schema::{Failure, Kind, Verdict};
-use scanhub_verbs::{Bounds, LatencyOptions, latency};
+use scanhub_verbs::LatencyArgs;
 
-fn options(place: &Place, topics: &[&str], count: u64) -> LatencyOptions {
-    LatencyOptions {
-        topics: topics.iter().map(|topic| (*topic).to_owned()).collect(),
-        json: true,
-        terminal: false,
-        wait: Wait::default(),
-        realtime: false,
-        max_p99: None,
-        bounds: Bounds { count: Some(count), ..Bounds::default() },
-        places: place.places(),
-    }
-}
+use crate::fake::{FakeHub, Place, Verb};
 
-fn start(options: LatencyOptions) -> Verb {
-    Verb::start(move |out, notes, stop| latency(&options, out, notes, stop))
+/// Runs `latency` with these arguments and without real-time priority.
+fn start(place: &Place, is_json: bool, arguments: &str) -> Verb {
+    let command = LatencyArgs::augment_args(Command::new("latency").no_binary_name(true));
+    let words = arguments.split(' ').chain(["--no-realtime"]);
+    let args = LatencyArgs::from_arg_matches(&command.get_matches_from(words)).expect("arguments");
+    let places = place.places();
+    Verb::start(move |out, notes, stop| args.run(is_json, true, &places, out, notes, stop))
 }
 
 /// Three zones, stamped when they are sent, to a consumer that listens.
-fn three_zones(place: &Place, options: LatencyOptions) -> (Result<(), Failure>, String, String) {
+fn three_zones(place: &Place, is_json: bool, arguments: &str) -> (Result<(), Failure>, String, String) {
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let verb = start(options);
+    let verb = start(place, is_json, arguments);
     hub.front().zones.await_subscribers(1);
     // It has to be past its subscription, which is told by nothing but what it receives.
     while !verb.finished() {
@@ -45,10 +38,9 @@ fn told<'a>(out: &'a str, topic: &str) -> &'a str {
 
 #[test]
 fn each_wait_tells_ages() {
-    for (wait, name) in [(Wait::Doorbell, "doorbell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
+    for name in ["doorbell", "event", "spin"] {
         let place = Place::new();
-        let (end, out, _) =
-            three_zones(&place, LatencyOptions { wait, ..options(&place, &["front/zones"], 40) });
+        let (end, out, _) = three_zones(&place, true, &format!("front/zones -n 40 --wait {name}"));
         assert_eq!(end, Ok(()), "{name}: {out}");
         let begin =
             format!(r#"{{"class":"conditions","wait":"{name}","realtime":false,"memory_locked":false,"#);
@@ -73,9 +65,9 @@ fn each_wait_tells_ages() {
 #[test]
 fn a_limit_is_kept_or_is_a_failed_check() {
     let place = Place::new();
-    let with = |limit| LatencyOptions { max_p99: Some(limit), ..options(&place, &["front/zones"], 20) };
-    assert_eq!(three_zones(&place, with(Duration::from_secs(60))).0, Ok(()));
-    let (end, out, _) = three_zones(&place, with(Duration::from_nanos(1)));
+    let with = |limit: &str| three_zones(&place, true, &format!("front/zones -n 20 --max-p99 {limit}"));
+    assert_eq!(with("60s").0, Ok(()));
+    let (end, out, _) = with("0.001us");
     let failure = end.expect_err("nobody is that fast");
     assert_eq!(failure.kind, Kind::Check);
     assert!(failure.message.starts_with("front/zones: p99 of the age on arrival is "), "{failure}");
@@ -87,8 +79,7 @@ fn a_limit_is_kept_or_is_a_failed_check() {
 fn what_was_sent_before_is_no_latency() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let limit = Some(Duration::from_secs(60));
-    let verb = start(LatencyOptions { max_p99: limit, ..options(&place, &["front/scan", "front/scan"], 5) });
+    let verb = start(&place, true, "front/scan front/scan -n 5 --max-p99 60s");
     hub.front().scan.await_subscribers(1);
     // Stamps of the first seconds after the machine's start.
     while !verb.finished() {
@@ -107,10 +98,7 @@ fn what_was_sent_before_is_no_latency() {
 #[test]
 fn as_text() {
     let place = Place::new();
-    let (end, out, notes) = three_zones(
-        &place,
-        LatencyOptions { json: false, terminal: true, ..options(&place, &["front/zones"], 20) },
-    );
+    let (end, out, notes) = three_zones(&place, false, "front/zones -n 20");
     assert_eq!(end, Ok(()));
     assert!(
         notes.starts_with("wait by doorbell, normal priority, memory not locked; the clock takes "),
@@ -124,7 +112,7 @@ fn as_text() {
 #[test]
 fn a_line_each_second_and_a_hub_that_is_replaced() {
     let place = Place::new();
-    let verb = start(LatencyOptions { bounds: Bounds::default(), ..options(&place, &["front/zones"], 0) });
+    let verb = start(&place, true, "front/zones");
     let tell = |boot, lines| {
         let mut hub = FakeHub::new(&place.domain, &["front"], boot);
         hub.front().zones.await_subscribers(1);
@@ -148,8 +136,8 @@ fn a_line_each_second_and_a_hub_that_is_replaced() {
 #[test]
 fn without_a_hub_it_ends_within_a_second() {
     let place = Place::new();
-    let failure = start(options(&place, &["front/scan"], 1)).join().0.expect_err("no hub");
+    let failure = start(&place, true, "front/scan -n 1").join().0.expect_err("no hub");
     assert_eq!(failure.kind, Kind::NoHub);
-    let failure = start(options(&place, &["front"], 1)).join().0.expect_err("no topic");
+    let failure = start(&place, true, "front -n 1").join().0.expect_err("no topic");
     assert_eq!(failure.kind, Kind::Usage);
 }
