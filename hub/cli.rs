@@ -11,7 +11,6 @@ mod doctor;
 mod examples;
 mod gateway;
 mod generated;
-mod leds;
 mod probe;
 pub(crate) mod record;
 pub(crate) mod replay;
@@ -41,7 +40,6 @@ pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
-pub(crate) use leds::Leds;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
@@ -173,8 +171,7 @@ pub(crate) enum Verb {
     /// Check and draw the plan of sensors, rooms and doors that people are followed in
     Site(SiteArgs),
     /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
-    #[command(after_help = leds::MEANING)]
-    Leds(Leds),
+    Leds(scanhub_verbs::LedsArgs),
     /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
     #[command(after_help = scanhub_network::groups_help())]
     Gateway(Gateway),

@@ -142,8 +142,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             scanhub_verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
         }
         Verb::Latency(latency) => {
-            let is_terminal = out.is_terminal();
-            latency.run(json, is_terminal, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?)
+            latency.run(json, out.is_terminal(), &everywhere.places()?, &mut out, &mut notes, &*interrupt()?)
         }
         // Every signal that ends it must restore the terminal.
         Verb::Watch(watch) => {
@@ -174,9 +173,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Track(track) => track.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Tilt(tilt) => tilt.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Site(site) => site.run(json, &mut out),
-        Verb::Leds(leds) => {
-            scanhub_verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
-        }
+        Verb::Leds(leds) => leds.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Gateway(gateway) => {
             let (tell, stop) = (interrupt_by(&[SIGUSR1])?, interrupt()?);
             gateway.args()?.run(&everywhere.verb(), &mut out, &mut io::stderr(), &tell, &stop)

@@ -1,139 +1,154 @@
-//! `scanhub leds`: the zone verdict and the mark count of a sensor as lights, in the terminal and on light-emitting
-//! diodes of the machine. The lights never show a better state than is known: the verb starts and ends with the stop
-//! light, and shows it when the hub is silent.
+//! `scanhub leds`: shows the zone verdict and the mark count of a sensor as lights, in the terminal and on LEDs of the machine.
+//! The lights never show a better state than is known: the red light is on at the start, at the end, and while the hub is
+//! silent.
 
 mod device;
-mod hold;
-mod lamps;
 
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::io::{self, IsTerminal, Write};
+use std::mem;
+use std::os::fd::AsFd;
+use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use clap::Args;
 use scanhub_client::clock;
 use scanhub_client::streams::{Freshness, Sample};
 use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use scanhub_shm::Domain;
 use serde::Serialize;
 
+use self::device::{Device, News};
 use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
-use crate::output::{End, Output, quiet};
-use crate::{json, text};
-use device::{Device, News};
-use hold::Hold;
-use lamps::{Lamps, Light};
+use crate::output::{End, Output, colors, quiet};
+use crate::{duration, json, text};
 
-/// What `leds` is asked for.
-#[derive(Clone, Debug)]
-pub struct LedsOptions {
-    /// The sensor, or `robot` for the verdict over all of them.
-    pub sensor: String,
-    /// `LIGHT=NAME`: the light-emitting diode that shows a light; one light may have several, not one diode several lights.
-    pub leds: Vec<String>,
-    /// Where they are: `/sys/class/leds`.
-    pub led_root: PathBuf,
-    /// How lights are shown in the terminal.
-    pub look: LedsLook,
-    /// Early warnings count too.
-    pub early: bool,
-    /// How long a better verdict has to stand until it is shown; a worse one is at once.
-    pub hold: Duration,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `leds`.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = MEANING)]
+pub struct LedsArgs {
+    /// The sensor, or robot for the verdict over all sensors
+    sensor: String,
+    /// LEDs of this machine that show the lights too: green=NAME, yellow=NAME, red=NAME, mark=NAME, separated by commas;
+    /// red is lit when the verdict is unknown, and after the end
+    #[arg(long = "led", value_name = "LIGHT=NAME", value_delimiter = ',')]
+    leds: Vec<String>,
+    /// Directory of the LEDs
+    #[arg(long, default_value = "/sys/class/leds", value_name = "DIR")]
+    led_root: PathBuf,
+    /// How long a better verdict must last before it is shown; a worse one is shown at once
+    #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
+    hold: Duration,
+    /// Show early warnings too, before a scan is complete (docs/early.md)
+    #[arg(long)]
+    early: bool,
+    #[command(flatten)]
+    bounds: Bounds,
 }
 
-/// How lights are shown in the terminal.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LedsLook {
-    /// A line for each change.
-    Lines,
-    /// An object for each change.
-    Json,
-    /// One line that is drawn over itself.
-    Terminal {
-        /// Lit lights have their colour.
-        colours: bool,
-    },
-}
+const MEANING: &str = "green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
 
-/// Shows the lights on `out` and on the diodes until the bounds are reached or `stop` is set; what is no light goes to
-/// `notes` (stderr) if `out` is not JSON. However it ends, the stop light is on then: nobody watches any more.
-///
-/// [`Kind::Configuration`] if a diode is not there or stands for no light; [`Kind::Failed`] if one may not be
-/// switched; else as [`echo`](crate::echo()). An LED that fails later is reported and tried again; the others
-/// continue.
-pub fn leds(
-    options: &LedsOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let LedsOptions { sensor, leds, .. } = options;
-    let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
-    if sensor != ROBOT {
-        as_word(check_followed(sensor))?;
-    }
-    let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
-    let wanted = wanted(sensor, leds)?;
-    let mut board = Board {
-        sensor,
-        look: options.look,
-        lamps: Lamps::UNKNOWN,
-        verdict: Hold::new(options.hold),
-        marks: Freshness::new(clock::now()),
-        losses: Vec::new(),
-        devices: Vec::new(),
-        out: Output::new(out),
-        notes: Output::new(notes),
-    };
-    let began = board.take(&options.led_root, &wanted).and_then(|()| board.show(Lamps::UNKNOWN, true));
-    let LedsOptions { places, bounds, .. } = options;
-    let mut following = Following::new(&names, &[], places, bounds, stop).with_lines();
-    if options.early {
-        following = following.with_early();
-    }
-    let end = began.and_then(|()| board.run(&mut following));
-    quiet(end.and(board.leave()))
-}
-
-/// Light and name in each of `leds`. A name stands once: a diode that showed two lights would not tell which.
-fn wanted<'a>(sensor: &str, leds: &'a [String]) -> Result<Vec<(Light, &'a str)>, Failure> {
-    let mut wanted: Vec<(Light, &str)> = Vec::new();
-    for led in leds {
-        let refuse =
-            |hint: &str| Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint));
-        let Some((light, name)) = led.split_once('=') else { return refuse(LED_FORM) };
-        let Some(light) = Light::ALL.into_iter().find(|it| it.name() == light) else {
-            return refuse(&format!("no light {light:?}: {LED_FORM}"));
+impl LedsArgs {
+    /// Shows the lights on `out` and on the LEDs until the limits are reached or `stop` is set. Notices go to `notes` (stderr)
+    /// without `json`. However the run ends, the red light is on then. An LED that fails during the run is reported and
+    /// tried again, while the others continue.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Configuration`] if an LED does not exist or its light is unknown.
+    /// - [`Kind::Failed`] if an LED may not be switched.
+    /// - The errors of [`echo`](crate::echo()).
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut (impl Write + AsFd),
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let sensor = &self.sensor;
+        let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
+        if sensor != ROBOT {
+            as_word(check_followed(sensor))?;
+        }
+        let names: Vec<_> = topics.iter().map(|&topic| TopicName { sensor: sensor.clone(), topic }).collect();
+        let wanted = self.wanted()?;
+        let mut board = Board {
+            sensor,
+            look: match (json, out.as_fd().is_terminal()) {
+                (true, _) => Look::Json,
+                (false, true) => Look::Terminal { colors: colors() },
+                (false, false) => Look::Lines,
+            },
+            lamps: Lamps::UNKNOWN,
+            verdict: Hold::new(self.hold),
+            marks: Freshness::new(clock::now()),
+            losses: Vec::new(),
+            devices: Vec::new(),
+            out: Output::new(out),
+            notes: Output::new(notes),
         };
-        if light == Light::Mark && sensor == ROBOT {
-            return refuse("marks belong to one sensor: name the sensor");
+        let mut following = Following::new(&names, &[], places, &self.bounds, stop).with_lines();
+        if self.early {
+            following = following.with_early();
         }
-        if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
-            return refuse(&format!("{name} already shows {}: each light has its own LEDs", other.name()));
-        }
-        wanted.push((light, name));
+        let end = board.open(self, &wanted).and_then(|()| board.run(&mut following));
+        quiet(end.and(board.leave()))
     }
-    Ok(wanted)
+
+    /// Returns the light and the name of each `--led`. Each name is unique: an LED for two lights would be ambiguous.
+    fn wanted(&self) -> Result<Vec<(Light, &str)>, Failure> {
+        let mut wanted: Vec<(Light, &str)> = Vec::new();
+        for led in &self.leds {
+            let refuse = |hint: &str| {
+                Err(Failure::new(Kind::Configuration, format!("--led {led} cannot be shown"), hint))
+            };
+            let Some((light, name)) = led.split_once('=') else { return refuse(LED_FORM) };
+            let Some(light) = Light::ALL.into_iter().find(|it| it.name() == light) else {
+                return refuse(&format!("no light {light:?}: {LED_FORM}"));
+            };
+            if light == Light::Mark && self.sensor == ROBOT {
+                return refuse("marks belong to one sensor: name the sensor");
+            }
+            if let Some((other, _)) = wanted.iter().find(|(_, taken)| *taken == name) {
+                return refuse(&format!(
+                    "{name} already shows {}: each light has its own LEDs",
+                    other.name()
+                ));
+            }
+            wanted.push((light, name));
+        }
+        Ok(wanted)
+    }
 }
 
 const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a NAME from /sys/class/leds";
 
-/// The lights as they are.
+/// How the lights are shown on stdout.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Look {
+    /// A line of text for each change.
+    Lines,
+    /// A JSON object for each change.
+    Json,
+    /// One line that is redrawn.
+    Terminal {
+        /// Whether lights that are on have their color.
+        colors: bool,
+    },
+}
+
+/// The lights and their state.
 struct Board<'a> {
     sensor: &'a str,
-    look: LedsLook,
+    look: Look,
     lamps: Lamps,
-    /// What was said lately.
     verdict: Hold,
-    /// Until when the marks may be believed, whatever became of the zones.
+    /// Age of the mark count, which does not depend on the zones.
     marks: Freshness,
-    /// What each sensor's line takes away, of those that lose something.
+    /// Text on the loss of each sensor whose line loses data.
     losses: Vec<(String, String)>,
     devices: Vec<(Light, String, Device)>,
     out: Output<'a>,
@@ -141,59 +156,59 @@ struct Board<'a> {
 }
 
 impl Board<'_> {
-    /// Takes the diodes below `root`.
-    fn take(&mut self, root: &Path, wanted: &[(Light, &str)]) -> Result<(), End> {
+    /// Opens the LEDs, and shows that nothing is known yet.
+    fn open(&mut self, args: &LedsArgs, wanted: &[(Light, &str)]) -> Result<(), End> {
         for &(light, name) in wanted {
-            let (device, trigger) = Device::open(root, name)?;
+            let (device, trigger) = Device::open(&args.led_root, name)?;
             self.devices.push((light, name.to_owned(), device));
             if let Some(trigger) = trigger {
                 self.note(&format!("{name} was lit by {trigger}, now it shows {}", light.name()))?;
             }
         }
-        Ok(())
+        self.show(Lamps::UNKNOWN, true)
     }
 
-    /// Shows the verdict that holds, and so many marks.
+    /// Shows the held verdict and the number of marks.
     fn show_known(&mut self, marks: Option<usize>, now: Instant) -> Result<(), End> {
         let (verdict, worst) = self.verdict.shown(now).clone();
         self.show(Lamps { verdict, marks, worst }, false)
     }
 
-    /// Shows `lamps` if they are others than those that are shown, or if they `must` be.
-    fn show(&mut self, lamps: Lamps, must: bool) -> Result<(), End> {
-        if self.lamps == lamps && !must {
+    /// Shows `lamps` if they differ from those that are shown, or `always`.
+    fn show(&mut self, lamps: Lamps, always: bool) -> Result<(), End> {
+        if self.lamps == lamps && !always {
             return Ok(());
         }
         self.lamps = lamps;
-        // First what acts, then what tells.
+        // The LEDs come first: output may be slow.
         self.switch(Instant::now())?;
         self.draw()
     }
 
     fn switch(&mut self, now: Instant) -> Result<(), End> {
-        let mut told = Vec::new();
+        let mut changes = Vec::new();
         for (light, name, device) in &mut self.devices {
             if let Some(news) = device.show(self.lamps.lit(*light), now) {
-                told.push((*light, name.clone(), news));
+                changes.push((*light, name.clone(), news));
             }
         }
-        told.into_iter().try_for_each(|(light, name, news)| self.tell(light, &name, news))
+        changes.into_iter().try_for_each(|(light, name, news)| self.report(light, &name, news))
     }
 
-    /// Says what became of a diode.
-    fn tell(&mut self, light: Light, name: &str, news: News) -> Result<(), End> {
+    /// Reports that an LED failed or is back.
+    fn report(&mut self, light: Light, name: &str, news: News) -> Result<(), End> {
         let (state, failure) = match news {
             News::Failed(failure) => ("failed", Some(failure)),
             News::Back => ("back", None),
         };
-        if self.look == LedsLook::Json {
+        if self.look == Look::Json {
             let (message, hint) = failure.map(|it| (it.message, it.hint)).unzip();
             return self.out.json(&Led { class: "led", light: light.name(), name, state, message, hint });
         }
         self.note(&failure.map_or(format!("{name} is back"), |failure| failure.to_string()))
     }
 
-    /// A line beside the lights, which are drawn again below it.
+    /// Writes a line to `notes`. The lights are redrawn below it.
     fn note(&mut self, what: &str) -> Result<(), End> {
         self.wipe()?;
         self.notes.line(|line| write!(line, "{what}"))
@@ -204,19 +219,19 @@ impl Board<'_> {
         let Board { sensor, lamps, .. } = self;
         let (sensor, reason) = (*sensor, reason.as_deref());
         match self.look {
-            LedsLook::Json => self.out.json(&Line::new(sensor, lamps, reason)),
-            LedsLook::Lines => self.out.line(|line| lamps.line(line, sensor, reason, false)),
-            LedsLook::Terminal { colours } => {
-                // A line that wraps would not be drawn over: it is cut.
+            Look::Json => self.out.json(&Line::new(sensor, lamps, reason)),
+            Look::Lines => self.out.line(|line| lamps.line(line, sensor, reason, false)),
+            Look::Terminal { colors } => {
+                // A line that wraps could not be redrawn, so the terminal cuts it.
                 let mut line = [WIPE, b"\x1b[?7l"].concat();
-                lamps.line(&mut line, sensor, reason, colours)?;
+                lamps.line(&mut line, sensor, reason, colors)?;
                 line.extend(b"\x1b[?7h");
                 self.out.raw(&line)
             }
         }
     }
 
-    /// What may be behind the verdict: what the line of the sensor takes away whose verdict it is, else that of any.
+    /// Returns a possible reason of the verdict: the loss on the line of the sensor whose verdict it is, or of any other.
     fn reason(&self) -> Option<String> {
         let whose = self.lamps.worst.as_deref();
         let of_worst = self.losses.iter().find(|(sensor, _)| Some(sensor.as_str()) == whose);
@@ -227,24 +242,22 @@ impl Board<'_> {
 
     fn wipe(&mut self) -> Result<(), End> {
         match self.look {
-            LedsLook::Terminal { .. } => self.out.raw(WIPE),
-            LedsLook::Json | LedsLook::Lines => Ok(()),
+            Look::Terminal { .. } => self.out.raw(WIPE),
+            Look::Json | Look::Lines => Ok(()),
         }
     }
 
-    /// The stop light stays, because nobody watches any more.
+    /// Turns the red light on, because the sensor is not watched from now on.
     fn leave(&mut self) -> Result<(), End> {
         self.show(Lamps::UNKNOWN, false)?;
-        // Also if it was lost before it was shown.
+        // An LED may have failed when it was switched.
         self.switch(Instant::now())?;
         match self.look {
-            LedsLook::Terminal { .. } => self.out.raw(b"\n"),
-            LedsLook::Json | LedsLook::Lines => Ok(()),
+            Look::Terminal { .. } => self.out.raw(b"\n"),
+            Look::Json | Look::Lines => Ok(()),
         }
     }
-}
 
-impl Board<'_> {
     fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
         while let Some(event) = following.next(self.verdict.changes_at())? {
             match event {
@@ -268,7 +281,7 @@ impl Board<'_> {
                 self.verdict.take((heard.robot.verdict(), worst), now);
             }
             Sample::Marks(sample) => {
-                // A number of marks ages as a verdict does of which something is known.
+                // A number of marks expires like a verdict that is known.
                 let fresh = self.marks.heard(sample.header(), Verdict::Clear, clock::now());
                 marks = (fresh && sample.is_available()).then(|| sample.marks().len());
             }
@@ -277,7 +290,7 @@ impl Board<'_> {
         self.show_known(marks, now)
     }
 
-    /// Reported when a line starts or stops losing data; the changing amount is not.
+    /// Redraws when a line starts or stops to lose data, but not when the amount changes.
     fn line(&mut self, sensor: &str, status: &Status) -> Result<(), End> {
         let known = self.losses.iter().position(|(name, _)| name == sensor);
         let loss = status.line_loss();
@@ -292,22 +305,22 @@ impl Board<'_> {
     }
 
     fn notice(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
-        // Not worth a word: what counts is what stands now.
+        // Only the newest sample counts.
         if matches!(notice, Notice::Missed(_)) {
             return Ok(());
         }
-        if self.look == LedsLook::Json {
+        if self.look == Look::Json {
             return json::notices(&mut self.out, names, &notice);
         }
         self.wipe()?;
         self.notes.line(|line| text::notice(line, names, &notice))?;
         match self.look {
-            LedsLook::Terminal { .. } => self.draw(),
-            LedsLook::Json | LedsLook::Lines => Ok(()),
+            Look::Terminal { .. } => self.draw(),
+            Look::Json | Look::Lines => Ok(()),
         }
     }
 
-    /// Marks that became too old go out, a verdict that has stood is shown, and diodes that failed are tried again.
+    /// Turns off marks that are too old, shows a verdict that has lasted, and tries LEDs again that failed.
     fn tick(&mut self, now: Instant) -> Result<(), End> {
         let marks = if self.marks.silence(clock::now()) { None } else { self.lamps.marks };
         self.show_known(marks, now)?;
@@ -315,7 +328,7 @@ impl Board<'_> {
     }
 }
 
-/// Class `leds`.
+/// Line of class `leds`.
 #[derive(Serialize)]
 struct Line<'a> {
     class: &'static str,
@@ -353,7 +366,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Class `led`: a diode that failed, or is back.
+/// Line of class `led`: an LED failed, or is back.
 #[derive(Serialize)]
 struct Led<'a> {
     class: &'static str,
@@ -364,5 +377,247 @@ struct Led<'a> {
     hint: Option<String>,
 }
 
-/// To the line's begin, and nothing on it (ECMA-48).
+/// Moves the cursor to the start of the line, and erases it (ECMA-48).
 const WIPE: &[u8] = b"\r\x1b[K";
+
+/// A light.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Light {
+    /// Nothing is inside any circle.
+    Green,
+    /// Something is inside, but not inside the smallest circle.
+    Yellow,
+    /// Something is inside the smallest circle, or it is not known.
+    Red,
+    /// A reflector mark is seen.
+    Mark,
+}
+
+impl Light {
+    /// All lights, in the order of all output.
+    const ALL: [Light; 4] = [Light::Green, Light::Yellow, Light::Red, Light::Mark];
+
+    /// The light's name in all output and on the command line.
+    fn name(self) -> &'static str {
+        match self {
+            Light::Green => "green",
+            Light::Yellow => "yellow",
+            Light::Red => "red",
+            Light::Mark => "mark",
+        }
+    }
+
+    /// Color on a terminal (ECMA-48, SGR).
+    fn color(self) -> u8 {
+        match self {
+            Light::Green => 32,
+            Light::Yellow => 33,
+            Light::Red => 31,
+            Light::Mark => 36,
+        }
+    }
+}
+
+/// Known state of a sensor, which decides what lights are on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Lamps {
+    /// Verdict of the zones.
+    verdict: Verdict,
+    /// Number of marks in the last scan; `None` if it is unknown.
+    marks: Option<usize>,
+    /// The sensor that the verdict is from, if there are several.
+    worst: Option<String>,
+}
+
+impl Lamps {
+    /// No sensor is watched: the red light is on.
+    const UNKNOWN: Lamps = Lamps { verdict: Verdict::Unknown, marks: None, worst: None };
+
+    /// Returns whether `light` is on. An unknown verdict counts as stop.
+    fn lit(&self, light: Light) -> bool {
+        match light {
+            Light::Green => self.verdict == Verdict::Clear,
+            Light::Yellow => self.verdict == Verdict::Slow,
+            Light::Red => matches!(self.verdict, Verdict::Stop | Verdict::Unknown),
+            Light::Mark => self.marks.is_some_and(|marks| marks > 0),
+        }
+    }
+
+    /// Writes the lights of `sensor` and a possible `reason`, readable with colors and without.
+    fn line(&self, line: &mut Vec<u8>, sensor: &str, reason: Option<&str>, colors: bool) -> io::Result<()> {
+        write!(line, "{sensor}")?;
+        for light in Light::ALL {
+            let (name, lit) = (light.name(), self.lit(light));
+            let sign = if lit { '●' } else { '○' };
+            match (lit, colors) {
+                (true, true) => write!(line, "  \x1b[1;{}m{sign} {name}\x1b[0m", light.color())?,
+                _ => write!(line, "  {sign} {name}")?,
+            }
+        }
+        write!(line, "  {}", self.verdict.name())?;
+        if let Some(worst) = &self.worst {
+            write!(line, " {worst}")?;
+        }
+        match self.marks {
+            Some(1) => write!(line, ", 1 mark")?,
+            Some(marks) => write!(line, ", {marks} marks")?,
+            None => {}
+        }
+        match reason {
+            Some(reason) => write!(line, ", {reason}"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// A verdict, and the sensor that it is from, if there are several.
+type SensorVerdict = (Verdict, Option<String>);
+
+/// Holds a verdict for some time, so that the lights do not flicker. It shows the worst verdict of that time: a worse one at
+/// once, a better one after it has lasted.
+struct Hold {
+    hold: Duration,
+    current: SensorVerdict,
+    /// Worse verdicts before, with the time of their last end.
+    before: Vec<(SensorVerdict, Instant)>,
+}
+
+impl Hold {
+    /// A verdict counts for `hold` after its end. The first one is unknown.
+    fn new(hold: Duration) -> Hold {
+        Hold { hold, current: (Verdict::Unknown, None), before: Vec::new() }
+    }
+
+    /// Takes a new verdict at `now`.
+    fn take(&mut self, said: SensorVerdict, now: Instant) {
+        let is_worse = |verdict: Verdict| verdict != said.0 && verdict.worse(said.0) == verdict;
+        self.before.retain(|((verdict, _), _)| is_worse(*verdict));
+        let ended = mem::replace(&mut self.current, said);
+        if ended.0 != self.current.0 && ended.0.worse(self.current.0) == ended.0 {
+            self.before.retain(|((verdict, _), _)| *verdict != ended.0);
+            self.before.push((ended, now));
+        }
+    }
+
+    /// Returns the verdict to show at `now`.
+    fn shown(&mut self, now: Instant) -> &SensorVerdict {
+        let hold = self.hold;
+        self.before.retain(|(_, until)| now.saturating_duration_since(*until) < hold);
+        let said = self.before.iter().map(|(said, _)| said);
+        said.fold(&self.current, |worst, said| if worst.0.worse(said.0) == said.0 { said } else { worst })
+    }
+
+    /// Returns when it may change without a new verdict.
+    fn changes_at(&self) -> Option<Instant> {
+        self.before.iter().filter_map(|(_, until)| until.checked_add(self.hold)).min()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use Verdict::{Clear, Slow, Stop, Unknown};
+
+    use super::*;
+
+    fn lamps(verdict: Verdict, marks: Option<usize>) -> Lamps {
+        Lamps { verdict, marks, worst: None }
+    }
+
+    #[test]
+    fn one_of_three_lights_is_on_and_the_fourth_by_itself() {
+        for (verdict, light) in [
+            (Verdict::Clear, Light::Green),
+            (Verdict::Slow, Light::Yellow),
+            (Verdict::Stop, Light::Red),
+            (Verdict::Unknown, Light::Red),
+        ] {
+            for (marks, is_lit) in [(None, false), (Some(0), false), (Some(1), true), (Some(12), true)] {
+                let lamps = lamps(verdict, marks);
+                for one in [Light::Green, Light::Yellow, Light::Red] {
+                    assert_eq!(lamps.lit(one), one == light, "{lamps:?}");
+                }
+                assert_eq!(lamps.lit(Light::Mark), is_lit);
+            }
+        }
+        assert!(Lamps::UNKNOWN.lit(Light::Red));
+    }
+
+    #[test]
+    fn lines() {
+        let text = |lamps: &Lamps, colors| {
+            let mut line = Vec::new();
+            lamps.line(&mut line, "front", None, colors).unwrap();
+            String::from_utf8(line).unwrap()
+        };
+        let stop = Lamps { worst: Some("rear".into()), ..lamps(Verdict::Stop, None) };
+        assert_eq!(text(&stop, false), "front  ○ green  ○ yellow  ● red  ○ mark  stop rear");
+        let clear = lamps(Verdict::Clear, Some(1));
+        assert_eq!(text(&clear, false), "front  ● green  ○ yellow  ○ red  ● mark  clear, 1 mark");
+        assert_eq!(
+            text(&clear, true),
+            "front  \x1b[1;32m● green\x1b[0m  ○ yellow  ○ red  \x1b[1;36m● mark\x1b[0m  clear, 1 mark"
+        );
+        assert!(text(&lamps(Verdict::Slow, Some(0)), false).ends_with("  slow, 0 marks"));
+        let mut line = Vec::new();
+        stop.line(&mut line, "robot", Some("41 % lost on the line"), false).unwrap();
+        assert!(line.ends_with(b"  stop rear, 41 % lost on the line"));
+    }
+
+    const HOLD_MS: u64 = 300;
+
+    /// What is shown after each of these times and verdicts, and at each time without one.
+    fn shown(steps: &[(u64, Option<Verdict>)]) -> Vec<Verdict> {
+        let (mut hold, start) = (Hold::new(Duration::from_millis(HOLD_MS)), Instant::now());
+        let at = |ms| start + Duration::from_millis(ms);
+        let step = |&(ms, said): &(u64, Option<Verdict>)| {
+            if let Some(verdict) = said {
+                hold.take((verdict, None), at(ms));
+            }
+            hold.shown(at(ms)).0
+        };
+        steps.iter().map(step).collect()
+    }
+
+    #[test]
+    fn a_worse_verdict_is_shown_at_once_and_a_better_one_after_it_has_stood() {
+        let steps = [(0, Some(Clear)), (299, None), (300, None), (400, Some(Slow)), (401, Some(Stop))];
+        assert_eq!(shown(&steps), [Unknown, Unknown, Clear, Slow, Stop]);
+        let steps = [(0, Some(Stop)), (100, Some(Clear)), (399, Some(Clear)), (400, None)];
+        assert_eq!(shown(&steps), [Stop, Stop, Stop, Clear]);
+    }
+
+    #[test]
+    fn whoever_flickers_stays_worst() {
+        let steps: Vec<_> = (0..20).map(|n| (n * 200, Some(if n % 2 == 0 { Stop } else { Clear }))).collect();
+        assert!(shown(&steps).iter().all(|verdict| *verdict == Stop));
+    }
+
+    #[test]
+    fn it_gets_better_by_steps() {
+        let steps =
+            [(0, Some(Stop)), (10, Some(Slow)), (110, Some(Clear)), (309, None), (310, None), (409, None)];
+        assert_eq!(shown(&steps), [Stop, Stop, Stop, Stop, Slow, Slow]);
+        assert_eq!(shown(&[&steps[..], &[(410, None)]].concat()).last(), Some(&Clear));
+    }
+
+    #[test]
+    fn what_is_shown_is_of_the_sensor_that_said_it_and_its_end_is_known() {
+        let (mut hold, now) = (Hold::new(Duration::from_millis(HOLD_MS)), Instant::now());
+        hold.take((Stop, Some("rear".into())), now);
+        assert_eq!(hold.changes_at(), None);
+        hold.take((Clear, Some("front".into())), now);
+        assert_eq!(hold.shown(now), &(Stop, Some("rear".into())));
+        let end = now + Duration::from_millis(HOLD_MS);
+        assert_eq!((hold.changes_at(), hold.shown(end).clone()), (Some(end), (Clear, Some("front".into()))));
+        assert_eq!(hold.changes_at(), None);
+    }
+
+    #[test]
+    fn without_a_hold_all_is_shown_as_it_is_said() {
+        let (mut hold, now) = (Hold::new(Duration::ZERO), Instant::now());
+        for verdict in [Clear, Stop, Slow, Clear, Unknown, Clear] {
+            hold.take((verdict, None), now);
+            assert_eq!(hold.shown(now).0, verdict);
+        }
+    }
+}

@@ -37,7 +37,7 @@ pub use hz::{HzOptions, hz};
 pub use info::{InfoOptions, info};
 pub use json::error as error_line;
 pub use latency::LatencyArgs;
-pub use leds::{LedsLook, LedsOptions, leds};
+pub use leds::LedsArgs;
 pub use list::{ListOptions, list, list_domains};
 pub use mask::{MaskOptions, mask};
 #[cfg(feature = "record")]

@@ -135,6 +135,11 @@ pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
     Ok(())
 }
 
+/// Returns whether colors may be used: `NO_COLOR` is unset or empty (<https://no-color.org>).
+pub fn colors() -> bool {
+    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+}
+
 /// The columns of the terminal that `out` is, if it is one that says so.
 #[cfg(feature = "record")]
 pub fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {

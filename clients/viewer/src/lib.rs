@@ -15,6 +15,6 @@ mod watch;
 mod web;
 
 #[cfg(feature = "tui")]
-pub use watch::{WatchArgs, can_show_pictures, colors};
+pub use watch::{WatchArgs, can_show_pictures};
 #[cfg(feature = "web")]
 pub use web::WebArgs;

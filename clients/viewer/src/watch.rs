@@ -19,7 +19,7 @@ use scanhub_shm::Domain;
 use scanhub_verbs::Bounds;
 use scanhub_verbs::follow::{Event, Following, Notice};
 use scanhub_verbs::names::as_word;
-use scanhub_verbs::output::{End, quiet};
+use scanhub_verbs::output::{End, colors, quiet};
 
 use crate::live_scene::{LiveScene, TOPICS, followed};
 use crate::scene::Scene;
@@ -110,11 +110,6 @@ impl WatchArgs {
 /// Returns whether stdout is a terminal with cursor control.
 pub fn can_show_pictures() -> bool {
     stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
-}
-
-/// Returns whether colors may be used: `NO_COLOR` is unset or empty (<https://no-color.org>).
-pub fn colors() -> bool {
-    std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
 struct Watcher<'a> {

@@ -1,5 +1,5 @@
-//! An LED of the machine, which Linux offers as a directory of files (Documentation/leds/leds-class.rst): written only
-//! when its state changes, and used again when it comes back. Refuses to know what it stands for; time is an argument.
+//! An LED of the machine, which Linux offers as a directory of files (Documentation/leds/leds-class.rst). It is written only
+//! when its state changes, and used again when it comes back. Time is an argument.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -9,21 +9,21 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Kind};
 
-/// How often a light that cannot be switched is tried again.
+/// Interval at which an LED that cannot be switched is tried again.
 const AGAIN: Duration = Duration::from_secs(1);
 
-/// One light.
-pub(crate) struct Device {
+/// An LED.
+pub(super) struct Device {
     directory: PathBuf,
-    /// What it shows; nothing if that is not known.
+    /// `None` if its state is unknown.
     lit: Option<bool>,
-    /// It could not be switched: when to try again.
+    /// Time of the next try, if it could not be switched.
     again_at: Option<Instant>,
 }
 
-/// What became of a light.
+/// Change of an LED.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum News {
+pub(super) enum News {
     /// It cannot be switched any more.
     Failed(Failure),
     /// It can be switched again.
@@ -31,12 +31,13 @@ pub(crate) enum News {
 }
 
 impl Device {
-    /// The light `name` below `root`, switched off. Taken from whatever made it blink, because who names it wants it to
-    /// show something else; from what is the second value.
+    /// Opens the LED `name` below `root`, and switches it off. Also returns the trigger that controlled it and that this ended.
     ///
-    /// [`Kind::Configuration`] with the lights that there are if it is not one of them, [`Kind::Failed`] with whose it
-    /// is if it may not be switched.
-    pub(crate) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
+    /// # Errors
+    ///
+    /// - [`Kind::Configuration`] if there is no such LED; the hint lists those that exist.
+    /// - [`Kind::Failed`] if it may not be switched; the hint names its owner.
+    pub(super) fn open(root: &Path, name: &str) -> Result<(Device, Option<String>), Failure> {
         if !root.is_dir() {
             let message = format!("{} is no directory", root.display());
             return Err(Failure::new(
@@ -57,12 +58,12 @@ impl Device {
         Ok((device, trigger))
     }
 
-    /// Switches it if it does not show `on` already; something to tell only if that went otherwise than before.
-    pub(crate) fn show(&mut self, on: bool, now: Instant) -> Option<News> {
+    /// Switches it unless it shows `on` already. Returns news if that starts or stops to fail.
+    pub(super) fn show(&mut self, on: bool, now: Instant) -> Option<News> {
         if self.lit == Some(on) || self.again_at.is_some_and(|at| now < at) {
             return None;
         }
-        // What was away may have come back as it is after power-on.
+        // An LED that was unplugged may have the state after power-on.
         let taken = if self.again_at.is_some() { self.take() } else { Ok(()) };
         match taken.and_then(|()| self.switch(on)) {
             Ok(()) => self.again_at.take().map(|_| News::Back),
@@ -74,10 +75,10 @@ impl Device {
         }
     }
 
-    /// Ends a trigger, which would go on beside what is written, and switches the light off.
+    /// Ends a trigger, which would otherwise go on, and switches the LED off.
     fn take(&mut self) -> io::Result<()> {
         if self.trigger().is_some() {
-            // Not everybody who may switch a light may do this; switching it off ends a trigger, too.
+            // This may be forbidden although the LED may be switched. Switching it off ends a trigger, too.
             let _ = write(&self.directory.join(TRIGGER), b"none\n");
         }
         self.switch(false)
@@ -95,7 +96,7 @@ impl Device {
         text.trim().parse().map_err(|_| io::Error::other(format!("its max_brightness is {:?}", text.trim())))
     }
 
-    /// What makes it blink by itself: the word in brackets, unless that is `none`.
+    /// Returns the active trigger: the word in brackets, unless that is `none`.
     fn trigger(&self) -> Option<String> {
         let text = fs::read_to_string(self.directory.join(TRIGGER)).ok()?;
         let (_, rest) = text.split_once('[')?;
