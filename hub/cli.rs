@@ -4,18 +4,14 @@ mod background;
 mod bridge;
 mod complete;
 mod config;
-mod configure;
 mod control;
 mod convert;
-mod doctor;
 mod examples;
 mod gateway;
 mod generated;
-mod probe;
 pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
-mod telegram;
 mod zones;
 
 use std::path::PathBuf;
@@ -42,7 +38,6 @@ pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
-pub(crate) use telegram::{Telegram, Way};
 pub(crate) use zones::Zones;
 
 /// Share laser scanners (SICK LMS 2xx, LDROBOT, RPLIDAR) between programs. One hub reads the ports; any number of programs get
@@ -124,14 +119,19 @@ pub(crate) enum Verb {
     #[command(after_help = simulate::fault_table())]
     Simulate(Box<simulate::Simulate>),
     /// Show the sensor at a port; without a port, list the ports
-    Probe(probe::Probe),
+    Probe(scanhub_tools::probe::ProbeArgs),
     /// Change a sensor's EEPROM settings: shows the difference and asks first
-    #[command(after_help = configure::CONSENT)]
-    Configure(configure::Configure),
+    #[command(after_help = scanhub_tools::configure::CONSENT)]
+    Configure(scanhub_tools::configure::ConfigureArgs),
     /// Print a default configuration, check one, or show the values in effect and their origin
     Config(Config),
     /// Check the setup and show how to fix what is wrong
-    Doctor(doctor::Doctor),
+    Doctor {
+        #[command(flatten)]
+        args: scanhub_tools::doctor::DoctorArgs,
+        #[command(flatten)]
+        run: Run,
+    },
     /// List the sensors and topics of the running hub
     List {
         /// List every live domain of this user instead
@@ -157,7 +157,7 @@ pub(crate) enum Verb {
     #[command(after_help = record::READING)]
     Record(Record),
     /// Explain telegrams field by field, or write them
-    Telegram(Telegram),
+    Telegram(scanhub_tools::telegram::TelegramArgs),
     /// Pause a sensor, resume it, or restart its session
     Control(Control),
     /// Show, reset, freeze, save or load the background model of a sensor

@@ -28,7 +28,7 @@ use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
 
-use cli::{Cli, Everywhere, Verb, Way};
+use cli::{Cli, Everywhere, Verb};
 use demo::DemoOptions;
 use mounts::SimulatedMounts;
 
@@ -85,13 +85,11 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             demo::demo(&options, &mut out, &*stop?)
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
-        Verb::Telegram(telegram) => match &telegram.way {
-            Way::Decode(decode) => {
-                scanhub_tools::telegram::decode(&decode.options(everywhere.json), &mut out)
-            }
-        },
-        Verb::Probe(probe) => probe.run(everywhere, &*interrupt()?),
-        Verb::Configure(configure) => configure.run(everywhere, &*interrupt_by(&ENDS)?),
+        Verb::Telegram(telegram) => telegram.run(json, &mut out),
+        Verb::Probe(probe) => probe.run(json, &everywhere.places()?, &mut out, &*interrupt()?),
+        Verb::Configure(configure) => {
+            configure.run(json, &everywhere.places()?, &mut out, &*interrupt_by(&ENDS)?)
+        }
         Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => completions.run(),
         Verb::Complete(complete) => {
@@ -100,7 +98,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
-        Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
+        Verb::Doctor { args, run } => {
+            let domains = (everywhere.hub_domain()?, everywhere.places()?);
+            args.run(&run.sources(), domains, json, &mut out, &*interrupt()?)
+        }
         Verb::List { domains: true } => {
             let hubs = if everywhere.root.is_none() { RunningHub::all(Path::new("/")) } else { Vec::new() };
             scanhub_verbs::list_domains(&everywhere.bases(), &hubs, everywhere.json, &mut out)

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use scanhub_schema::Failure;
+use scanhub_tools::Progress;
 use scanhub_verbs::{MaskOptions, duration};
 
 use super::Everywhere;
-use super::probe::Progress;
 
 #[derive(Args, Debug)]
 pub(crate) struct Zones {
@@ -49,7 +49,7 @@ impl Zones {
             json: everywhere.json,
             places: everywhere.places()?,
         };
-        let mut progress = Progress::new();
+        let mut progress = Progress::on_stderr();
         let mut tell = |what: Option<&str>| match what {
             Some(what) => progress.show(what),
             None => progress.clear(),

@@ -6,8 +6,10 @@
 
 use std::fmt;
 use std::io::{IsTerminal, Write, stderr, stdin};
+use std::os::fd::AsFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use clap::Args;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
 use scanhub_drivers::Inquiry;
@@ -25,103 +27,128 @@ use scanhub_shm::Domain;
 use serde::Serialize;
 
 use crate::driver::{Procedure, drive};
-use crate::probe::{check_unused, hex, measuring, open, request_report};
+use crate::probe::{check_unused, hex, measuring, open, request_report, source};
+use crate::terminal::{Progress, print};
 
-/// The settings to change, and the port of the scanner.
-#[derive(Clone, Debug)]
-pub struct ConfigureRequest {
-    /// The port.
-    pub source: Source,
-    /// The locations in which a client would search for the domain of a hub, which may use the port.
-    pub places: Vec<Domain>,
-    /// `KEY=VALUE`, as given.
-    pub settings: Vec<String>,
-    /// Password of the installation mode: 8 ASCII characters.
-    pub password: String,
+/// Arguments of `configure`.
+#[derive(Args, Debug)]
+pub struct ConfigureArgs {
+    /// Port of the sensor: a tty or tcp:HOST:PORT
+    #[arg(value_name = "PORT")]
+    port: String,
+    /// Settings to write: unit=mm|cm, mode=NAME|0x01, availability=1|2|3, indices=on|off, sensitivity=standard|medium|low|high,
+    /// power_on_baud=9600|keep, configuration=HEX
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Password of the installation mode
+    #[arg(long, default_value = "SICK_LMS", value_name = "WORD")]
+    password: String,
 }
 
-/// Progress and results to report.
-#[derive(Debug)]
-pub enum ConfigureEvent<'a> {
-    /// The scanner is searched for at this rate.
-    Searching(u32),
-    /// One value that would change.
-    Difference(&'a Difference),
-    /// All differences were reported, and a person must confirm them now.
-    Asking,
-    /// The step that runs now, as text.
-    Step(&'static str),
-    /// The change succeeded, or there was nothing to change.
-    Configured(&'a Configured),
-}
+/// Text about the confirmation, for the end of the help.
+pub const CONSENT: &str = "A person must confirm. If stdin or stderr is not a terminal, the difference is \
+                           shown, nothing is written, and the exit code is 2";
 
-/// Carries out `request`; calls `tell` with progress and results.
-///
-/// # Errors
-///
-/// Returns an error of one of these kinds:
-///
-/// - [`Kind::Configuration`] for a key or a value that is unknown, or that this type of scanner does not support.
-///   Nothing has been written then.
-/// - [`Kind::Usage`] if there is no terminal at which a person could confirm.
-/// - The kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`].
-/// - [`Kind::Failed`] with the state of the scanner, if the change failed or was not confirmed.
-pub fn configure(
-    request: &ConfigureRequest,
-    stop: &AtomicBool,
-    tell: &mut dyn FnMut(ConfigureEvent<'_>),
-) -> Result<(), Failure> {
-    let requested = SettingsRequest::parse(&request.settings)?;
-    let password = parse_password(&request.password)?;
-    check_unused(&request.source, &request.places)?;
-    let (port, first) = open(&request.source, stop)?;
-    let rate = if let Source::Tcp { .. } = request.source { None } else { Some(first) };
-    let inquiry = Inquiry::begin(rate, clock::now());
-    let report = request_report(&port, first, inquiry, (&request.source, true), stop, |rate| {
-        tell(ConfigureEvent::Searching(rate))
-    })?;
-    let name = request.source.name();
-    let Some(mut plan) = Plan::of(&report) else {
-        return Err(Failure::new(
-            Kind::Timeout,
-            format!("{name}: the sensor does not report its configuration"),
-            "nothing was written; power it off and on, then try again",
-        ));
-    };
-    plan.password = password;
-    let family = report.kind().and_then(Family::of_type);
-    requested.apply(&mut plan, family, &report)?;
-    if plan.is_empty() {
-        tell(ConfigureEvent::Configured(&Configured::nothing(&name, &plan)));
-        return Ok(());
-    }
-    let was_permanent = report.status().map(|status| status.has_permanent_baud());
-    for difference in Difference::all(&name, &plan, family, was_permanent) {
-        tell(ConfigureEvent::Difference(&difference));
-    }
-    tell(ConfigureEvent::Asking);
-    let consent = ask_person(plan, stop)?;
-    // A scanner that streams has filled the input buffer in the meantime.
-    port.discard_input(plan.baud.rate()).map_err(|error| lost_before_writing(&name, &error))?;
-    let mut change = Change::new(consent, clock::now());
-    if let Source::Tcp { .. } = request.source {
-        change = change.behind_server();
-    }
-    let mut shown = None;
-    // An interrupt would leave the change incomplete. It takes seconds, and ends in any case.
-    let never_stop = AtomicBool::new(false);
-    let mut procedure = Procedure::new(|change: &Change| {
-        if shown != Some(change.step()) {
-            shown = Some(change.step());
-            tell(ConfigureEvent::Step(describe_step(change.step())));
+impl ConfigureArgs {
+    /// Changes the settings, and prints differences and the result to `out`. `places` are the locations in which a client
+    /// would search for the domain of a hub, which may use the port.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error of one of these kinds:
+    ///
+    /// - [`Kind::Configuration`] for a key or a value that is unknown, or that this type of scanner does not support.
+    ///   Nothing has been written then.
+    /// - [`Kind::Usage`] if there is no terminal at which a person could confirm.
+    /// - The kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`].
+    /// - [`Kind::Failed`] with the state of the scanner, if the change failed or was not confirmed.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut (impl Write + AsFd),
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        // The person who confirms must see the differences, even if stdout is redirected.
+        let repeats = !out.as_fd().is_terminal() && stderr().is_terminal();
+        let mut progress = Progress::on_stderr();
+        let result = self.configure(json, places, out, repeats, &mut progress, stop);
+        if result.is_err() {
+            progress.leave();
         }
-        true
-    });
-    let result = drive(&port, &mut change, &mut procedure, &never_stop);
-    result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;
-    let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
-    tell(ConfigureEvent::Configured(&configured));
-    Ok(())
+        result
+    }
+
+    /// Changes the settings. A line that cannot be written to `out` does not stop a change. `repeats` states whether
+    /// differences are also written to stderr.
+    fn configure(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        repeats: bool,
+        progress: &mut Progress,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let source = source(&self.port)?;
+        let requested = SettingsRequest::parse(&self.settings)?;
+        let password = parse_password(&self.password)?;
+        check_unused(&source, places)?;
+        let (port, first) = open(&source, stop)?;
+        let rate = if let Source::Tcp { .. } = source { None } else { Some(first) };
+        let inquiry = Inquiry::begin(rate, clock::now());
+        let report = request_report(&port, first, inquiry, (&source, true), stop, |rate| {
+            progress.show(&format!("looking at {rate} Bd"))
+        })?;
+        let name = source.name();
+        let Some(mut plan) = Plan::of(&report) else {
+            return Err(Failure::new(
+                Kind::Timeout,
+                format!("{name}: the sensor does not report its configuration"),
+                "nothing was written; power it off and on, then try again",
+            ));
+        };
+        plan.password = password;
+        let family = report.kind().and_then(Family::of_type);
+        requested.apply(&mut plan, family, &report)?;
+        if plan.is_empty() {
+            progress.clear();
+            let nothing = Configured::nothing(&name, &plan);
+            let _ = print(out, json, &nothing, || nothing.to_string());
+            return Ok(());
+        }
+        let was_permanent = report.status().map(|status| status.has_permanent_baud());
+        progress.clear();
+        for difference in Difference::all(&name, &plan, family, was_permanent) {
+            let _ = print(out, json, &difference, || difference.to_string());
+            if repeats {
+                let _ = print(&mut stderr(), false, &difference, || difference.to_string());
+            }
+        }
+        let consent = ask_person(plan, stop)?;
+        // A scanner that streams has filled the input buffer in the meantime.
+        port.discard_input(plan.baud.rate()).map_err(|error| lost_before_writing(&name, &error))?;
+        let mut change = Change::new(consent, clock::now());
+        if let Source::Tcp { .. } = source {
+            change = change.behind_server();
+        }
+        let mut shown = None;
+        // An interrupt would leave the change incomplete. It takes seconds, and ends in any case.
+        let never_stop = AtomicBool::new(false);
+        let mut procedure = Procedure::new(|change: &Change| {
+            if shown != Some(change.step()) {
+                shown = Some(change.step());
+                progress.show(describe_step(change.step()));
+            }
+            true
+        });
+        let result = drive(&port, &mut change, &mut procedure, &never_stop);
+        result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;
+        let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
+        progress.clear();
+        let _ = print(out, json, &configured, || configured.to_string());
+        Ok(())
+    }
 }
 
 /// One value that would change; class `difference`.

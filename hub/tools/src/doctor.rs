@@ -12,18 +12,94 @@ mod sensor;
 mod shared_memory;
 
 use std::fmt;
+use std::io::Write;
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
-pub use crate::bridge_program::Bridge;
-pub(crate) use hub::Hub;
-pub use installation::System;
-use machine::Facts;
-use scanhub_config::{Config, Gateway, Link};
+use clap::Args;
+use scanhub_config::{Config, Gateway, Link, Sources};
 use scanhub_port::{Candidate, PortlessAdapter, Source, candidates};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Printable};
 use scanhub_shm::Domain;
 use serde::Serialize;
+
+pub use crate::bridge_program::Bridge;
+use crate::probe::source;
+use crate::terminal::print;
+pub(crate) use hub::Hub;
+pub use installation::System;
+use machine::Facts;
+
+/// Arguments of `doctor`.
+#[derive(Args, Debug)]
+pub struct DoctorArgs {
+    /// Ports to check: a tty or tcp:HOST:PORT, or the name of a link of the running hub; without one, the ports of the
+    /// configuration, or all ports if there are none, and the links of the running hub
+    #[arg(value_name = "PORT")]
+    ports: Vec<String>,
+    /// First remove what dead processes left in this domain; removes nothing while a hub runs there
+    #[arg(long)]
+    clean: bool,
+    /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would work.
+    /// Can be repeated
+    #[arg(long, value_name = "ADDRESS")]
+    bridge: Vec<String>,
+    /// The same by Zenoh's own configuration, as in `scanhub bridge --config`
+    #[arg(long, value_name = "FILE")]
+    bridge_config: Option<PathBuf>,
+}
+
+impl DoctorArgs {
+    /// Makes all checks, and prints each finding as soon as it is known. The configuration is that of `sources`. A hub would
+    /// create `domain`, and a client would search for it in `places`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`run_checks`], and [`Kind::Failed`] if `out` cannot be written.
+    pub fn run(
+        &self,
+        sources: &Sources,
+        (domain, places): (Domain, Vec<Domain>),
+        json: bool,
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let is_configured = !(sources.files.is_empty() && sources.links.is_empty() && sources.set.is_empty());
+        let read = sources.read();
+        let gateway = Gateway::of(&read);
+        let targets = CheckTargets {
+            ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
+            config: is_configured
+                .then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
+            gateway: gateway.clone().unwrap_or_default(),
+            domain,
+            places,
+            system: System::this(),
+            bridge: Bridge {
+                connect: self.bridge.clone(),
+                config: self.bridge_config.clone(),
+                ..Bridge::default()
+            },
+            clean: self.clean,
+        };
+        let mut port = None;
+        let mut written = Ok(());
+        let result = run_checks(&targets, stop, &mut |finding| {
+            if written.is_err() {
+                return;
+            }
+            let mut heading = String::new();
+            if port != finding.port {
+                port.clone_from(&finding.port);
+                let link = finding.link.as_ref().map(|link| format!(" (link {link})"));
+                heading = format!("\n{}{}\n", port.as_deref().unwrap_or_default(), link.unwrap_or_default());
+            }
+            written = print(out, json, finding, || format!("{heading}{finding}"));
+        });
+        written.and(result)
+    }
+}
 
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]

@@ -7,3 +7,6 @@ pub mod doctor;
 mod driver;
 pub mod probe;
 pub mod telegram;
+mod terminal;
+
+pub use terminal::Progress;

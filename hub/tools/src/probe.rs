@@ -5,9 +5,11 @@
 mod description;
 
 use std::fmt;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
 use scanhub_drivers::search::{self, Coverage};
 use scanhub_drivers::{Inquiry, Report, features, inquiry};
 use scanhub_port::{
@@ -19,13 +21,158 @@ use serde::Serialize;
 
 use crate::doctor::Hub;
 use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
+use crate::terminal::{Progress, print};
 use description::link_settings;
 pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 
+/// Arguments of `probe`.
+#[derive(Args, Debug)]
+pub struct ProbeArgs {
+    /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
+    #[arg(value_name = "PORT")]
+    port: Option<String>,
+    /// Print only the link for a configuration file
+    #[arg(long, requires = "port", conflicts_with = "json")]
+    toml: bool,
+}
+
+impl ProbeArgs {
+    /// Prints the scanner at the port, or the ports of this machine without opening any. `places` are the locations in which
+    /// a client would search for the domain of a hub.
+    ///
+    /// # Errors
+    ///
+    /// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open. Returns
+    /// [`Kind::PortMissing`] if there is no port to list, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`]
+    /// if `stop` is set.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let Some(port) = &self.port else { return list_ports(json, out) };
+        let mut progress = Progress::on_stderr();
+        let found =
+            probe(&source(port)?, places, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+        if found.is_err() {
+            progress.leave();
+        }
+        drop(progress);
+        let found = found?;
+        print(out, json, &found, || match self.toml {
+            true => found.link.toml(),
+            false => format!("{port}\n{found}"),
+        })
+    }
+}
+
+/// Prints the serial lines of this machine, and the adapters that have none.
+fn list_ports(json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    const PLUG_IN: &str =
+        "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it";
+    let (candidates, portless) = (candidates(), PortlessAdapter::all(Path::new("/")));
+    for candidate in &candidates {
+        print(out, json, &CandidateLine::of(candidate), || describe(candidate))?;
+    }
+    for adapter in &portless {
+        let remedy = adapter.remedy();
+        print(out, json, &AdapterLine::of(adapter), || format!("{adapter}\n  {remedy}"))?;
+    }
+    if !candidates.is_empty() {
+        return Ok(());
+    }
+    let remedy = portless.first().map_or(PLUG_IN.to_owned(), PortlessAdapter::remedy);
+    Err(Failure::new(Kind::PortMissing, "no serial line on this machine", remedy))
+}
+
+/// Class `candidate`.
+#[derive(Serialize)]
+struct CandidateLine<'a> {
+    class: &'static str,
+    port: String,
+    device: String,
+    driver: Option<&'a str>,
+    product: Option<&'a str>,
+    permitted: bool,
+    /// The process that has it open.
+    holder: Option<u32>,
+    program: Option<&'a str>,
+    /// The name below by-id that another adapter has too.
+    shared_name: Option<String>,
+    caution: Option<String>,
+    remedy: Option<String>,
+}
+
+impl<'a> CandidateLine<'a> {
+    fn of(candidate: &'a Candidate) -> CandidateLine<'a> {
+        let (caution, remedy) = caution(candidate).unzip();
+        CandidateLine {
+            class: "candidate",
+            port: candidate.name.display().to_string(),
+            device: candidate.device.display().to_string(),
+            driver: candidate.driver.as_deref(),
+            product: candidate.product.as_deref(),
+            permitted: candidate.is_permitted,
+            holder: candidate.holder.as_ref().map(|holder| holder.pid),
+            program: candidate.holder.as_ref().map(|holder| holder.program.as_str()),
+            shared_name: candidate.shared_name.as_ref().map(|name| name.display().to_string()),
+            caution,
+            remedy,
+        }
+    }
+}
+
+/// Class `adapter`.
+#[derive(Serialize)]
+struct AdapterLine<'a> {
+    class: &'static str,
+    usb: &'a str,
+    id: &'a str,
+    chip: &'a str,
+    module: &'a str,
+    problem: String,
+    remedy: String,
+}
+
+impl<'a> AdapterLine<'a> {
+    fn of(adapter: &'a PortlessAdapter) -> AdapterLine<'a> {
+        AdapterLine {
+            class: "adapter",
+            usb: &adapter.usb,
+            id: &adapter.id,
+            chip: adapter.chip,
+            module: adapter.module,
+            problem: adapter.to_string(),
+            remedy: adapter.remedy(),
+        }
+    }
+}
+
+/// Returns the caution about a port, including one about the name that it shares.
+fn caution(candidate: &Candidate) -> Option<(String, String)> {
+    candidate.caution(candidate.shared_name.as_ref().unwrap_or(&candidate.name))
+}
+
+fn describe(candidate: &Candidate) -> String {
+    let Candidate { name, device, driver, product, holder, is_permitted, .. } = candidate;
+    let state = match (holder, is_permitted) {
+        (Some(holder), _) => format!("in use by {holder}"),
+        (None, true) => "free".to_owned(),
+        (None, false) => format!("no permission: scanhub doctor {} shows the reason", name.display()),
+    };
+    let device = (name != device).then(|| device.display().to_string());
+    let facts: Vec<String> =
+        [device, product.clone(), driver.clone(), Some(state)].into_iter().flatten().collect();
+    let caution = caution(candidate).map(|(what, remedy)| format!("\n  {what}; {remedy}"));
+    format!("{}  {}{}", name.display(), facts.join(", "), caution.unwrap_or_default())
+}
+
 /// Scanner at a port, with the link that a configuration needs for it; class `probe`.
 #[derive(Clone, Debug, Serialize)]
-pub struct Probed {
+struct Probed {
     #[serde(flatten)]
     found: Found,
     /// Value of `--link`.
@@ -33,7 +180,7 @@ pub struct Probed {
     flag: String,
     /// Link for a configuration.
     #[serde(skip)]
-    pub link: SuggestedLink,
+    link: SuggestedLink,
     /// Caution about the port, and its remedy.
     #[serde(skip)]
     caution: Option<(String, String)>,
@@ -56,45 +203,9 @@ impl fmt::Display for Probed {
     }
 }
 
-/// The ports of this machine, and the adapters that have none.
-#[derive(Clone, Debug)]
-pub struct Ports {
-    /// The serial lines.
-    pub candidates: Vec<Candidate>,
-    /// USB serial adapters without a port.
-    pub portless: Vec<PortlessAdapter>,
-}
-
-impl Ports {
-    /// Lists the ports of this machine, without opening any.
-    pub fn of_machine() -> Ports {
-        Ports { candidates: candidates(), portless: PortlessAdapter::all(Path::new("/")) }
-    }
-
-    /// Checks that there is a serial line.
-    ///
-    /// # Errors
-    ///
-    /// Returns [`Kind::PortMissing`] if there is none.
-    pub fn check(&self) -> Result<(), Failure> {
-        const PLUG_IN: &str =
-            "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it";
-        if !self.candidates.is_empty() {
-            return Ok(());
-        }
-        let remedy = self.portless.first().map_or(PLUG_IN.to_owned(), PortlessAdapter::remedy);
-        Err(Failure::new(Kind::PortMissing, "no serial line on this machine", remedy))
-    }
-}
-
 /// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `look` with
-/// each rate at which it searches. `places` are the locations in which a client would search for the domain of a hub.
-///
-/// # Errors
-///
-/// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open. Returns
-/// [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`] if `stop` is set.
-pub fn probe(
+/// each rate at which it searches.
+fn probe(
     source: &Source,
     places: &[Domain],
     stop: &AtomicBool,
@@ -221,7 +332,7 @@ fn listed(rates: &[u32]) -> String {
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`] if `text` does not name a port.
-pub fn source(text: &str) -> Result<Source, Failure> {
+pub(crate) fn source(text: &str) -> Result<Source, Failure> {
     Source::parse(text).map_err(|what| {
         Failure::new(
             Kind::Configuration,

@@ -11,6 +11,7 @@ use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
+use clap::{Args, Subcommand};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::explain::{Field, Headline, Value, explain};
 use scanhub_drivers::lms::reply::Reply;
@@ -23,33 +24,53 @@ use serde::Serialize;
 
 use parser::{Item, StreamParser};
 
-/// Options of `telegram decode`.
-#[derive(Clone, Debug, Default)]
-pub struct DecodeOptions {
-    /// The file to read; `None` or `-` is stdin.
-    pub file: Option<PathBuf>,
-    /// Sensor of a recording with several sensors.
-    pub sensor: Option<String>,
-    /// Measuring mode, such as `0x01` or `1`; `None` selects the mode in the telegrams.
-    pub mode: Option<String>,
-    /// Whether to print every value instead of a summary.
-    pub all: bool,
-    /// Whether to print one JSON object per line.
-    pub json: bool,
+/// Arguments of `telegram`.
+#[derive(Args, Debug)]
+pub struct TelegramArgs {
+    #[command(subcommand)]
+    action: Action,
 }
 
-/// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and reports the bytes
-/// between them. The bytes of a recording are those of its telegrams, in order.
-///
-/// # Errors
-///
-/// Returns [`Kind::Check`] if there is no telegram, [`Kind::Input`] if the input cannot be read, [`Kind::NoTopic`] if the
-/// recording does not have this sensor, and [`Kind::Usage`] if it has several sensors and none is selected.
-pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failure> {
-    let requested = options.mode.as_deref().map(parse_mode).transpose()?;
-    let file = options.file.as_deref().filter(|path| *path != Path::new("-"));
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// Decode bytes to text: the telegrams in a recording, a pipe, or text such as 02 00 01 00 31 15 12
+    Decode(DecodeArgs),
+}
+
+#[derive(Args, Debug)]
+struct DecodeArgs {
+    /// File with the bytes, raw or as text, or an MCAP recording; - or nothing is stdin
+    file: Option<PathBuf>,
+    /// Decode only this sensor, if the recording has several
+    #[arg(long, value_name = "NAME")]
+    sensor: Option<String>,
+    /// Measuring mode of the values, for example 0x01 [default: the mode in the telegrams]
+    #[arg(long, value_name = "BYTE")]
+    mode: Option<String>,
+    /// Print every value of long lists
+    #[arg(long)]
+    all: bool,
+}
+
+impl TelegramArgs {
+    /// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and reports the bytes
+    /// between them. The bytes of a recording are those of its telegrams, in order.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Check`] if there is no telegram, [`Kind::Input`] if the input cannot be read, [`Kind::NoTopic`] if the
+    /// recording does not have this sensor, and [`Kind::Usage`] if it has several sensors and none is selected.
+    pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+        let Action::Decode(args) = &self.action;
+        decode(args, json, out)
+    }
+}
+
+fn decode(args: &DecodeArgs, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    let requested = args.mode.as_deref().map(parse_mode).transpose()?;
+    let file = args.file.as_deref().filter(|path| *path != Path::new("-"));
     let name = file.map_or("stdin".into(), |path| path.display().to_string());
-    let (reader, of_recording): (Box<dyn Read>, _) = match (file, &options.sensor) {
+    let (reader, of_recording): (Box<dyn Read>, _) = match (file, &args.sensor) {
         (Some(path), sensor) if sensor.is_some() || is_framed(path) => {
             open_recording(path, sensor.as_deref())?
         }
@@ -66,7 +87,7 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
     };
     let mode = requested.or(of_recording);
     let mut input = Input::new(reader).map_err(|error| unreadable(&name, &error))?;
-    let form = match (options.json, options.all) {
+    let form = match (json, args.all) {
         (true, _) => OutputForm::Json,
         (false, all) => OutputForm::Text { all },
     };

@@ -64,7 +64,7 @@ fn consent_is_given_by_persons() {
         vec![
             tree.with("hub/daemon/src/link.rs", planted),
             tree.with("hub/tools/src/probe.rs", planted),
-            tree.with("hub/cli/configure.rs", planted),
+            tree.with("hub/cli/planted.rs", planted),
             tree.with(
                 "hub/tools/src/configure.rs",
                 &ask.replace("fn ask_person", &format!("{planted}fn ask_person")),

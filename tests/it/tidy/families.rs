@@ -33,9 +33,8 @@ const FAMILIES: [(&str, &[&str]); 2] = [
 const HUB: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 
 /// Sources of the hub that name the LMS, each with the reason.
-const MAY_NAME_LMS: [&str; 5] = [
+const MAY_NAME_LMS: [&str; 4] = [
     // Changes settings in the EEPROM, which only an LMS has.
-    "hub/cli/configure.rs",
     "hub/tools/src/configure",
     // Explains telegrams byte by byte, which only an LMS sends.
     "hub/tools/src/telegram",
