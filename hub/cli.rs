@@ -9,7 +9,6 @@ mod convert;
 mod examples;
 mod gateway;
 mod generated;
-pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
 mod zones;
@@ -36,7 +35,6 @@ pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
-pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use zones::Zones;
 
@@ -154,8 +152,7 @@ pub(crate) enum Verb {
     /// Serve the live picture to browsers, and to Foxglove and Lichtblick
     Web(scanhub_viewer::WebArgs),
     /// Record what the hub publishes in MCAP files
-    #[command(after_help = record::READING)]
-    Record(Record),
+    Record(scanhub_verbs::RecordArgs),
     /// Explain telegrams field by field, or write them
     Telegram(scanhub_tools::telegram::TelegramArgs),
     /// Pause a sensor, resume it, or restart its session

@@ -150,15 +150,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             watch.run(&everywhere.places()?, everywhere.json, &mut out, &*interrupt_by(&ENDS)?)
         }
         Verb::Web(web) => replay::page::run(web, everywhere, &mut out, &interrupt()?),
+        // Whatever ends it, the file is finished.
         Verb::Record(record) => {
-            let options = record.options(everywhere)?;
-            // Whatever ends it, the file is finished.
-            let stop = interrupt_by(&ENDS)?;
-            let mut stderr = io::stderr();
-            match record.is_to_stdout() {
-                true => scanhub_verbs::record(&options, &mut io::stderr(), &mut stderr, &stop),
-                false => scanhub_verbs::record(&options, &mut out, &mut stderr, &stop),
-            }
+            record.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt_by(&ENDS)?)
         }
         Verb::Control(control) => {
             scanhub_verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?)

@@ -126,7 +126,7 @@ impl LedsArgs {
 
 const LED_FORM: &str = "green=NAME, yellow=NAME, red=NAME or mark=NAME, with a NAME from /sys/class/leds";
 
-/// How the lights are shown on stdout.
+/// Form of the lights on stdout.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Look {
     /// A line of text for each change.

@@ -41,4 +41,4 @@ pub use leds::LedsArgs;
 pub use list::{ListOptions, list, list_domains};
 pub use mask::{MaskOptions, mask};
 #[cfg(feature = "record")]
-pub use record::{RecordLook, RecordOptions, Split, record};
+pub use record::RecordArgs;

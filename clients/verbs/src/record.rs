@@ -1,16 +1,19 @@
-//! `scanhub record`: what the hub publishes, in MCAP files. The thread that receives never touches the disk, so that a
-//! slow, full or missing disk costs no live topic a sample. What is missing in the recording is counted, reported, and
-//! visible in the file.
+//! `scanhub record`: writes what the hub publishes to MCAP files.
+//!
+//! The path of a sample, from top to bottom:
+//!
+//! 1. The topics: [`RecordArgs::run`] follows the selected ones, and [`Recorder::sample`] receives the sample.
+//! 2. The queue ([`Queue`]) is bounded. A sample that finds no room is left out, counted, reported, and becomes part of a
+//!    [`Gap`] in the file.
+//! 3. The disk thread ([`Disk::run`]) takes the whole queue ten times a second. It alone touches the disk, so a slow, full or
+//!    missing disk does not delay any live topic.
+//! 4. The file ([`Part`](part::Part)) makes a chunk of it and writes it. [`Files`] names the files and removes old ones.
 
 mod disk;
 mod files;
-mod lock;
-mod output_error;
 mod part;
 mod queue;
 mod report;
-mod selection;
-mod writer_progress;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -22,167 +25,262 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use clap::Args;
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
 use scanhub_files::output::Target;
 use scanhub_schema::file::Compression;
-use scanhub_schema::{Failure, Header, Kind};
+use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
 
+use self::disk::Disk;
+use self::files::{Files, Split};
+use self::part::{Form, Style};
+use self::queue::{Entry, Gap, News, Queue, WriterProgress};
+use self::report::{Look, Report};
 use crate::follow::{Bounds, Event, Following};
 use crate::lossy_writer::LossyWriter;
 use crate::names::TopicName;
 use crate::output::{End, quiet};
 use crate::receive_stats::ReceiveStats;
-use disk::Disk;
-use files::Files;
-pub use files::Split;
-use part::{Form, Style};
-use queue::{Entry, Gap, Queue};
-use report::Report;
-use selection::Selection;
-use writer_progress::{News, WriterProgress};
+use crate::selection::Selection;
 
-/// What `record` is asked for.
-#[derive(Clone, Debug)]
-pub struct RecordOptions {
-    /// `SENSOR/TOPIC` or `*/TOPIC`; none: what is usual, of all sensors.
-    pub topics: Vec<String>,
-    /// All topics instead of the usual ones.
-    pub everything: bool,
-    /// Scans as messages of ROS 2 and where the sensors sit, and nothing else.
-    pub ros2: bool,
-    /// How its chunks are packed.
-    pub compression: Compression,
-    /// The file; `-` is stdout, and without one it is named after the time.
-    pub file: Option<PathBuf>,
-    /// What stands at the file's place is overwritten.
-    pub force: bool,
-    /// When it goes on in the next file.
-    pub split: Option<Split>,
-    /// Number of files that are kept; the oldest are removed first. With `force`, files of earlier runs count too.
-    pub keep: Option<usize>,
-    /// How it tells of itself.
-    pub look: RecordLook,
-    /// When it ends by itself.
-    pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `record`.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = READING)]
+pub struct RecordArgs {
+    /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics [default: telegram, marks,
+    /// zones, foreground and status of all sensors, tracks and events of trackers, tilt and obstacles of mounts]
+    #[arg(value_name = "SENSOR/TOPIC")]
+    topics: Vec<String>,
+    /// Record every topic of all sensors
+    #[arg(long, conflicts_with = "topics")]
+    all: bool,
+    /// Write ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
+    #[arg(long)]
+    ros2: bool,
+    /// Compression: zstd, lz4 or none
+    #[arg(long, value_name = "NAME", default_value = "zstd", value_parser = Compression::parse)]
+    compression: Compression,
+    /// File to write; - for stdout [default: scanhub-DATE-TIME.mcap]
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Overwrite an existing file; with --split, continue after the existing numbers, and let --keep remove older files
+    #[arg(short, long)]
+    force: bool,
+    /// Start another file after this size or time: 512MiB, 1h; the files are called FILE-0001.mcap ..
+    #[arg(long, value_name = "SIZE|DURATION", value_parser = Split::parse)]
+    split: Option<Split>,
+    /// Keep only the last COUNT files of this run; with --force, files FILE-NNNN.mcap of earlier runs count too
+    #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
+    keep: Option<u32>,
+    #[command(flatten)]
+    bounds: Bounds,
 }
 
-impl RecordOptions {
-    /// The file that stands for stdout.
-    pub const STDOUT: &str = "-";
+const READING: &str = "\
+The files are MCAP: any MCAP reader opens them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
+disk it waits and continues; it reports what is missing, which is a gap in the file's numbers.";
 
-    fn is_to_stdout(&self) -> bool {
-        self.file.as_deref() == Some(Path::new(Self::STDOUT))
+/// Recorded by default: telegrams, from which everything else can be computed again, and the most important results.
+const DEFAULT_TOPICS: [Topic; 9] = [
+    Topic::Telegram,
+    Topic::Marks,
+    Topic::Zones,
+    Topic::Foreground,
+    Topic::Status,
+    Topic::Tracks,
+    Topic::Events,
+    Topic::Tilt,
+    Topic::Obstacles,
+];
+
+/// Interval at which the receiving thread reads the progress of the disk thread.
+const LOOK_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Hint for a file that has no end.
+const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
+
+impl RecordArgs {
+    /// Returns whether stdout carries the recording, and nothing else.
+    pub fn is_to_stdout(&self) -> bool {
+        self.output.as_deref() == Some(Path::new("-"))
     }
-}
 
-/// How a recorder tells of itself.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RecordLook {
-    /// Lines at the begin, at the end and when something happens.
-    Lines,
-    /// Objects, once a second too.
-    Json,
-    /// A line that is drawn over itself.
-    Terminal,
-}
-
-/// Records until the bounds are reached or `stop` is set, and finishes the file; set again meanwhile, the end is not waited
-/// for. How far it is goes to `out`, and what is no account to `notes` (stderr) if `out` is not JSON; lines for which there
-/// is no room are left out before they delay what is recorded.
-///
-/// [`Kind::Output`] if there is no file to be had, [`Kind::Failed`] if its end cannot be written, [`Kind::Short`] if either is for
-/// lack of room; [`Kind::Usage`] if stdout is no place for
-/// it; else as [`echo`](crate::echo()).
-pub fn record(
-    options: &RecordOptions,
-    out: &mut (impl Write + AsFd),
-    notes: &mut (impl Write + AsFd),
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let selection = Selection::parse(&options.topics, options.everything, options.ros2)?;
-    let queue = Arc::new(Queue::new());
-    let disk = match begin(options, &queue) {
-        Ok(disk) => disk,
-        Err(end) => return quiet(Err(end)),
-    };
-    let (first, older) = (disk.path(), disk.surplus_older());
-    let over = AtomicBool::new(false);
-    let terminal = out.as_fd().try_clone_to_owned().ok();
-    let (mut out, mut notes) = (LossyWriter::around(out, &over), LossyWriter::around(notes, &over));
-    let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
-    let begun = report.begin(&first, older);
-    let mut recorder = Recorder {
-        progress: disk.progress(),
-        tracks: Vec::new(),
-        queue: queue.clone(),
-        pushed: 0,
-        left_out: 0,
-        gap: None,
-        tick_at: Instant::now(),
-        report,
-        over: &over,
-    };
-    let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
-    let writing = writing
-        .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
-    let (names, topics) = (selection.names(), selection.topics());
-    let mut following = Following::new(&names, &topics, &options.places, &options.bounds, stop).with_lines();
-    let end = begun.and_then(|()| {
-        let end = recorder.run(&mut following);
-        following.finish(end, |name, stats| recorder.summary(name, stats))
-    });
-    // If the hub or the reader of these lines went away, the recording is kept.
-    let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
-    let finished = recorder.finish(writing, stays, stop);
-    if !stays && !options.is_to_stdout() {
-        // A hub or sensor that is not there leaves nothing behind.
-        files::discard(&first);
+    /// Records until the bounds are reached or `stop` is set, and then finishes the file. If `stop` is set again meanwhile, the
+    /// run does not wait for that. Progress goes to `out`, or to `notes` (stderr) if stdout carries the recording. Notices go to
+    /// `notes` without `json`. Lines that their reader does not take are left out, so that they do not delay the recording.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Usage`] if the topics or stdout cannot be recorded.
+    /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::Short`] if either
+    ///   is for lack of space.
+    /// - The errors of [`echo`](crate::echo()).
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut (impl Write + AsFd),
+        notes: &mut (impl Write + AsFd),
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        match self.is_to_stdout() {
+            true => self.record(json, places, &mut io::stderr(), notes, stop),
+            false => self.record(json, places, out, notes, stop),
+        }
     }
-    quiet(end).and(quiet(finished))
-}
 
-/// The first file.
-fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
-    let wall_ns = clock::wall_ns();
-    let usual = files::usual_name(wall_ns);
-    let path = options.file.as_deref().unwrap_or(&usual);
-    let failed = |error: io::Error| output_error::failed(path, options.split.is_some(), &error);
-    let files = match options.is_to_stdout() {
-        true if options.split.is_some() => {
-            return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out").into());
+    fn record(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut (impl Write + AsFd),
+        notes: &mut (impl Write + AsFd),
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let look = match (json, out.as_fd().is_terminal()) {
+            (true, _) => Look::Json,
+            (false, true) => Look::Terminal,
+            (false, false) => Look::Lines,
+        };
+        let (names, topics) = selection(&self.topics, self.all, self.ros2)?;
+        let queue = Arc::new(Queue::new());
+        let disk = match self.begin(places, &queue) {
+            Ok(disk) => disk,
+            Err(end) => return quiet(Err(end)),
+        };
+        let (first, older) = (disk.path(), disk.surplus_older());
+        let over = AtomicBool::new(false);
+        let terminal = out.as_fd().try_clone_to_owned().ok();
+        let (mut out, mut notes) = (LossyWriter::around(out, &over), LossyWriter::around(notes, &over));
+        let mut report = Report::new(look, &mut out, &mut notes, terminal);
+        let begun = report.begin(&first, older);
+        let mut recorder = Recorder {
+            progress: disk.progress(),
+            tracks: Vec::new(),
+            queue: queue.clone(),
+            pushed: 0,
+            left_out: 0,
+            gap: None,
+            tick_at: Instant::now(),
+            report,
+            over: &over,
+        };
+        let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
+        let writing = writing
+            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+        let mut following = Following::new(&names, &topics, places, &self.bounds, stop).with_lines();
+        let end = begun.and_then(|()| {
+            let end = recorder.run(&mut following);
+            following.finish(end, |name, stats| recorder.summary(name, stats))
+        });
+        // The recording is kept if the hub or the reader of the lines went away.
+        let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
+        let finished = recorder.finish(writing, stays, stop);
+        if !stays && !self.is_to_stdout() {
+            // Without the hub or sensor, the run leaves no file.
+            files::discard(&first);
         }
-        true if io::stdout().is_terminal() => {
-            let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
-            return Err(Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint).into());
-        }
-        true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
-        false => {
-            let target = Target::open(path)?;
-            // A split run adds numbers to the name.
-            if options.split.is_none() {
-                target.check(options.force)?;
+        quiet(end).and(quiet(finished))
+    }
+
+    /// Starts the first file.
+    fn begin(&self, places: &[Domain], queue: &Arc<Queue>) -> Result<Disk, End> {
+        let wall_ns = clock::wall_ns();
+        let default = files::default_name(wall_ns);
+        let path = self.output.as_deref().unwrap_or(&default);
+        let failed = |error: io::Error| no_file(path, self.split.is_some(), &error);
+        let files = match self.is_to_stdout() {
+            true if self.split.is_some() => {
+                return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out").into());
             }
-            let run = wall_ns.to_string();
-            Ok(Files::new(path, options.split.is_some(), options.force, options.keep, &run))
-        }
-    };
-    let form = if options.ros2 { Form::Ros2 } else { Form::Hub };
-    let style = Style { form, compression: options.compression };
-    let begun = Disk::begin(queue.clone(), files, options.split, style, facts(options, wall_ns));
-    begun.map_err(|error| match error.kind() {
-        ErrorKind::BrokenPipe => output_error::reader_gone(0).into(),
-        _ => failed(error).into(),
-    })
+            true if io::stdout().is_terminal() => {
+                let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
+                return Err(
+                    Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint).into()
+                );
+            }
+            true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
+            false => {
+                let target = Target::open(path)?;
+                // A split run adds numbers to the name.
+                if self.split.is_none() {
+                    target.check(self.force)?;
+                }
+                let run = wall_ns.to_string();
+                Ok(Files::new(
+                    path,
+                    self.split.is_some(),
+                    self.force,
+                    self.keep.map(|keep| keep as usize),
+                    &run,
+                ))
+            }
+        };
+        let form = if self.ros2 { Form::Ros2 } else { Form::Hub };
+        let style = Style { form, compression: self.compression };
+        let begun = Disk::begin(queue.clone(), files, self.split, style, facts(places, wall_ns));
+        begun.map_err(|error| match error.kind() {
+            ErrorKind::BrokenPipe => reader_gone(0).into(),
+            _ => failed(error).into(),
+        })
+    }
 }
 
-/// What the recording says of itself.
-fn facts(options: &RecordOptions, wall_ns: u64) -> BTreeMap<String, String> {
+/// Returns the topics that `texts` name, and those of all sensors: without names, the default or `everything`. With `ros2`, they
+/// are scans, and the status of their sensors, which has their poses.
+///
+/// # Errors
+///
+/// [`Kind::Usage`] if there is no such topic, no hub publishes it, or ROS has no message for it.
+fn selection(
+    texts: &[String],
+    everything: bool,
+    ros2: bool,
+) -> Result<(Vec<TopicName>, Vec<Topic>), Failure> {
+    let mut chosen = Selection::parse(texts)?;
+    if texts.is_empty() {
+        chosen.of_all = match (everything, ros2) {
+            (true, true) => return Err(no_message("--all")),
+            (false, true) => vec![Topic::Scan],
+            (true, false) => Topic::ALL.to_vec(),
+            (false, false) => DEFAULT_TOPICS.to_vec(),
+        };
+    }
+    if let Some(fold) = chosen.named.iter().find(|name| name.is_robot()) {
+        let hint = "`*/zones` records the zones of each sensor";
+        return Err(Failure::new(Kind::Usage, format!("{fold} is computed by the consumer"), hint));
+    }
+    if ros2 {
+        let named = chosen.named.iter().map(|name| name.topic);
+        if let Some(other) = named.chain(chosen.of_all.iter().copied()).find(|&topic| topic != Topic::Scan) {
+            return Err(no_message(&format!("topic {}", other.name())));
+        }
+        let status = |name: &TopicName| TopicName { topic: Topic::Status, ..name.clone() };
+        let statuses: Vec<_> = chosen.named.iter().map(status).collect();
+        chosen.named.extend(statuses);
+        chosen.of_all.extend(chosen.of_all.first().map(|_| Topic::Status));
+    }
+    let mut names: Vec<TopicName> = Vec::new();
+    for name in chosen.named {
+        if !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    Ok((names, Topic::ALL.into_iter().filter(|topic| chosen.of_all.contains(topic)).collect()))
+}
+
+fn no_message(what: &str) -> Failure {
+    let message = format!("--ros2 records only ROS messages, and {what} is not one: only scans are");
+    let hint = "record without --ros2, and convert later: `scanhub convert IN.mcap OUT.mcap --ros2`";
+    Failure::new(Kind::Usage, message, hint)
+}
+
+/// Returns the description of the run in the recording.
+fn facts(places: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
     let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let domain = options.places.first().map(Domain::name).unwrap_or_default();
+    let domain = places.first().map(Domain::name).unwrap_or_default();
     let facts = [
         ("domain", domain),
         ("host", host.trim()),
@@ -193,97 +291,23 @@ fn facts(options: &RecordOptions, wall_ns: u64) -> BTreeMap<String, String> {
     facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
-/// A sample that is kept for the next file.
-struct Kept {
-    came_at: Instant,
-    header: Header,
-    payload: Vec<u8>,
-}
-
 struct Recorder<'a> {
     queue: Arc<Queue>,
     progress: Arc<WriterProgress>,
+    /// Topics of the recording, by their numbers in the queue.
     tracks: Vec<TopicName>,
-    /// Samples handed to the writing thread.
+    /// Samples that were passed to the disk thread.
     pushed: u64,
-    /// Samples for which there was no room.
+    /// Samples that the queue had no room for.
     left_out: u64,
     gap: Option<Gap>,
     tick_at: Instant,
     report: Report<'a>,
-    /// Nothing is received any more: now readers of lines may be waited for.
+    /// Set at the end, when the run may wait for readers of its lines.
     over: &'a AtomicBool,
 }
 
 impl Recorder<'_> {
-    /// A sample for which there is no room: from here on all are left out, until there is room again for many.
-    fn leave_out(&mut self, name: &TopicName) -> Result<(), End> {
-        self.left_out += 1;
-        let is_first = self.gap.is_none();
-        let now_ns = clock::wall_ns();
-        let gap =
-            self.gap.get_or_insert_with(|| Gap { from_ns: now_ns, to_ns: now_ns, left_out: Vec::new() });
-        match gap.left_out.iter_mut().find(|(other, _)| other == name) {
-            Some((_, count)) => *count += 1,
-            None => gap.left_out.push((name.clone(), 1)),
-        }
-        if is_first { self.report.gap_begins() } else { Ok(()) }
-    }
-
-    /// The gap is over: it is put down in the file, and told.
-    fn end_gap(&mut self) -> Result<(), End> {
-        let Some(mut gap) = self.gap.take() else { return Ok(()) };
-        gap.to_ns = clock::wall_ns();
-        let told = self.report.gap_ends(&gap);
-        self.queue.note(Entry::Gap(gap));
-        told
-    }
-
-    fn look(&mut self) -> Result<(), End> {
-        let stats = self.progress.look();
-        for news in stats.news.iter() {
-            if *news == News::ReaderGone {
-                return Err(output_error::reader_gone(stats.samples).into());
-            }
-            self.report.disk(news)?;
-        }
-        self.report.progress(&stats, self.left_out)
-    }
-
-    /// Waits until all of it is written, and says what came of it, if it `stays`. A second wish to stop ends that, too.
-    fn finish(
-        mut self,
-        writing: JoinHandle<io::Result<()>>,
-        stays: bool,
-        stop: &AtomicBool,
-    ) -> Result<(), End> {
-        self.over.store(true, Ordering::Relaxed);
-        stop.store(false, Ordering::Relaxed);
-        let told = self.end_gap();
-        self.queue.end();
-        let mut second = SecondStop::default();
-        while !writing.is_finished() {
-            if second.poll(stop.swap(false, Ordering::Relaxed)) {
-                let what = "the disk had not stored the end of the recording when a second signal came";
-                return Err(Failure::new(Kind::Failed, what, REPAIR).into());
-            }
-            thread::sleep(LOOK_EVERY);
-        }
-        let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
-        let stats = self.progress.look();
-        if let Err(error) = written {
-            if error.kind() == ErrorKind::BrokenPipe {
-                return Err(output_error::reader_gone(stats.samples).into());
-            }
-            let missing = self.pushed - stats.samples;
-            let what =
-                format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
-            return Err(Failure::new(output_error::kind(&error), what, REPAIR).into());
-        }
-        told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
-        if stays { self.report.end(&stats, self.left_out) } else { Ok(()) }
-    }
-
     fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
         while let Some(event) = following.next(None)? {
             match event {
@@ -294,7 +318,7 @@ impl Recorder<'_> {
                 Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
                 Event::Notice(names, notice) => self.report.hub(&names, notice)?,
                 Event::Tick(now) if now >= self.tick_at => {
-                    self.tick_at = now + LOOK_EVERY;
+                    self.tick_at = now + LOOK_INTERVAL;
                     self.look()?;
                 }
                 _ => {}
@@ -319,9 +343,78 @@ impl Recorder<'_> {
         Ok(())
     }
 
+    /// Leaves out a sample for which there is no room, and all that follow until there is room for many.
+    fn leave_out(&mut self, name: &TopicName) -> Result<(), End> {
+        self.left_out += 1;
+        let is_first = self.gap.is_none();
+        let now_ns = clock::wall_ns();
+        let gap =
+            self.gap.get_or_insert_with(|| Gap { from_ns: now_ns, to_ns: now_ns, left_out: Vec::new() });
+        match gap.left_out.iter_mut().find(|(other, _)| other == name) {
+            Some((_, count)) => *count += 1,
+            None => gap.left_out.push((name.clone(), 1)),
+        }
+        if is_first { self.report.gap_begins() } else { Ok(()) }
+    }
+
+    /// Ends the gap, and notes it in the file.
+    fn end_gap(&mut self) -> Result<(), End> {
+        let Some(mut gap) = self.gap.take() else { return Ok(()) };
+        gap.to_ns = clock::wall_ns();
+        let told = self.report.gap_ends(&gap);
+        self.queue.note(Entry::Gap(gap));
+        told
+    }
+
+    fn look(&mut self) -> Result<(), End> {
+        let stats = self.progress.look();
+        for news in stats.news.iter() {
+            if *news == News::ReaderGone {
+                return Err(reader_gone(stats.samples).into());
+            }
+            self.report.disk(news)?;
+        }
+        self.report.progress(&stats, self.left_out)
+    }
+
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         self.over.store(true, Ordering::Relaxed);
         self.report.topic(name, stats)
+    }
+
+    /// Waits until everything is written, and reports the result if the recording `stays`. A second request to stop ends the
+    /// wait.
+    fn finish(
+        mut self,
+        writing: JoinHandle<io::Result<()>>,
+        stays: bool,
+        stop: &AtomicBool,
+    ) -> Result<(), End> {
+        self.over.store(true, Ordering::Relaxed);
+        stop.store(false, Ordering::Relaxed);
+        let told = self.end_gap();
+        self.queue.end();
+        let mut second = SecondStop::default();
+        while !writing.is_finished() {
+            if second.poll(stop.swap(false, Ordering::Relaxed)) {
+                let what = "the disk had not stored the end of the recording when a second signal came";
+                return Err(Failure::new(Kind::Failed, what, REPAIR).into());
+            }
+            thread::sleep(LOOK_INTERVAL);
+        }
+        let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
+        let stats = self.progress.look();
+        if let Err(error) = written {
+            if error.kind() == ErrorKind::BrokenPipe {
+                return Err(reader_gone(stats.samples).into());
+            }
+            let missing = self.pushed - stats.samples;
+            let what =
+                format!("the end of the recording cannot be written: {error}; {missing} samples are missing");
+            return Err(Failure::new(kind(&error), what, REPAIR).into());
+        }
+        told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
+        if stays { self.report.end(&stats, self.left_out) } else { Ok(()) }
     }
 }
 
@@ -344,10 +437,42 @@ impl SecondStop {
     }
 }
 
-/// So often it is looked what the writing thread says.
-const LOOK_EVERY: Duration = Duration::from_millis(50);
-/// What can be done with a file that has no end.
-const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
+/// Returns the kind of failure for the error of a write. It is temporary if the disk or a quota is full.
+fn kind(error: &io::Error) -> Kind {
+    match error.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => Kind::Short,
+        _ => Kind::Failed,
+    }
+}
+
+/// Returns the failure to make a file at `path`.
+fn no_file(path: &Path, is_split: bool, error: &io::Error) -> Failure {
+    let hint = match error.kind() {
+        ErrorKind::AlreadyExists if is_split => {
+            "--force continues after the last number; -o FILE names others"
+        }
+        ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another",
+        ErrorKind::InvalidInput => "name another file: -o FILE",
+        ErrorKind::ResourceBusy => "stop it first, or name another file: -o FILE",
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+            "free some space, or name another place: -o FILE"
+        }
+        ErrorKind::FileTooLarge => "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE",
+        _ => "the directory must exist and be writable; -o FILE names another place",
+    };
+    let kind = match kind(error) {
+        Kind::Failed => Kind::Output,
+        other => other,
+    };
+    Failure::new(kind, format!("cannot record into {}: {error}", path.display()), hint)
+}
+
+/// Returns the failure that the reader of stdout went away. It has an incomplete recording.
+fn reader_gone(samples: u64) -> Failure {
+    let what = format!("the reader of the recording is gone: it has at most {samples} samples");
+    let hint = "see why the program or the connection behind the pipe ended; `scanhub convert` writes a copy with an index";
+    Failure::new(Kind::Failed, what, hint)
+}
 
 #[cfg(test)]
 mod tests {
@@ -360,6 +485,43 @@ mod tests {
         assert!((0..SecondStop::SAME_REQUEST).all(|_| !second.poll(true)));
         assert!(!second.poll(false));
         assert!(second.poll(true));
-        assert!(LOOK_EVERY * SecondStop::SAME_REQUEST >= Duration::from_secs(1));
+        assert!(LOOK_INTERVAL * SecondStop::SAME_REQUEST >= Duration::from_secs(1));
+    }
+
+    fn selected(texts: &[&str], everything: bool, ros2: bool) -> Result<(Vec<String>, Vec<Topic>), Failure> {
+        let (names, topics) =
+            selection(&texts.iter().map(|&text| text.to_owned()).collect::<Vec<_>>(), everything, ros2)?;
+        Ok((names.iter().map(TopicName::to_string).collect(), topics))
+    }
+
+    #[test]
+    fn what_is_usual_and_everything() {
+        assert_eq!(selected(&[], false, false).unwrap().1, DEFAULT_TOPICS);
+        assert_eq!(selected(&[], true, false).unwrap().1, Topic::ALL);
+        let some = selected(&["front/scan", "*/status", "front/scan"], false, false).unwrap();
+        assert_eq!(some, (vec!["front/scan".into()], vec![Topic::Status]));
+    }
+
+    #[test]
+    fn ros_takes_scans_and_where_their_sensors_sit() {
+        let ours = [Topic::Scan, Topic::Status];
+        assert_eq!(selected(&[], false, true).unwrap().1, ours);
+        assert_eq!(selected(&["*/scan"], false, true).unwrap().1, ours);
+        let front = selected(&["front/scan"], false, true).unwrap();
+        assert_eq!(front, (vec!["front/scan".into(), "front/status".into()], vec![]));
+        for (texts, everything) in [(&[][..], true), (&["front/zones"], false), (&["*/telegram"], false)] {
+            let failure = selected(texts, everything, true).unwrap_err();
+            assert_eq!(failure.kind, Kind::Usage, "{texts:?}");
+            assert!(failure.hint.contains("convert"), "{failure}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_topic_is_refused() {
+        let kind = |text| selected(&[text], false, false).map(drop).map_err(|failure| failure.kind);
+        for bad in ["front", "*/scam", "front/scam", "robot/scan", "*", "robot/zones", "Front/scan"] {
+            assert_eq!(kind(bad), Err(Kind::Usage), "{bad}");
+        }
+        assert_eq!(kind("front/*"), Ok(()));
     }
 }

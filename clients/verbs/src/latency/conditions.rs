@@ -26,7 +26,7 @@ pub(super) struct Conditions {
     /// Time that one read of the clock takes.
     clock_read_ns: f64,
     clock_resolution_ns: u64,
-    /// What the system refused, why, and how to permit it.
+    /// Requests that the system refused, with the reason and a remedy.
     refused: Vec<String>,
 }
 
@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn what_is_not_had_is_explained() {
-        // A thread of its own: it keeps the priority.
+        // The thread would keep the priority.
         let take = || Conditions::take(Wait::Spin, false).with_realtime(Wait::Spin, 2);
         let taken = thread::spawn(take).join().expect("no panic");
         assert!(!taken.realtime);

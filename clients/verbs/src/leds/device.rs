@@ -75,7 +75,7 @@ impl Device {
         }
     }
 
-    /// Ends a trigger, which would otherwise go on, and switches the LED off.
+    /// Ends a trigger, which would otherwise keep control of the LED, and switches it off.
     fn take(&mut self) -> io::Result<()> {
         if self.trigger().is_some() {
             // This may be forbidden although the LED may be switched. Switching it off ends a trigger, too.

@@ -1,5 +1,5 @@
-//! The thread that writes: takes the queue ten times a second, makes a chunk and writes it. If the disk is full, slow
-//! or missing, it reports that and tries again, while new samples wait in the queue. Refuses to know who receives.
+//! The disk thread: takes the queue ten times a second, makes a chunk and writes it. If the disk is full, slow or missing, it
+//! reports that and tries again, while new samples wait in the queue.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -10,11 +10,9 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::Topic;
 
-use super::Kept;
 use super::files::{Files, Split, discard};
-use super::part::{Part, Place, Style};
-use super::queue::{Batch, EVERY, Entry, Queue};
-use super::writer_progress::{News, WriterProgress};
+use super::part::{Kept, Part, Place, Style};
+use super::queue::{Batch, Entry, News, Queue, WRITE_INTERVAL, WriterProgress};
 use crate::names::TopicName;
 
 /// The writing of one run.
@@ -107,7 +105,7 @@ impl Disk {
     pub(super) fn run(mut self) -> io::Result<()> {
         let mut due = Instant::now();
         loop {
-            due = (due + EVERY).max(Instant::now());
+            due = (due + WRITE_INTERVAL).max(Instant::now());
             let is_over = self.queue.wait(due);
             let now = Instant::now();
             if self.trouble.as_ref().is_some_and(|trouble| !is_over && now < trouble.retry_at) {

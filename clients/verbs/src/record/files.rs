@@ -3,33 +3,30 @@
 //! With `--force`, files of earlier runs count as kept files too. Each file is checked again just before it is removed, so
 //! that neither a file that another recorder writes nor a file of another kind is ever lost.
 
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use rustix::fs::OFlags;
+use rustix::fs::{OFlags, major, minor};
 use scanhub_files::output::Target;
 use scanhub_schema::file::MAGIC;
 
-use super::lock;
 use crate::duration;
 
-/// When a recording goes on in the next file.
+/// Limit of a file, after which the recording continues in the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Split {
-    /// When a file is so long, in bytes.
+pub(super) enum Split {
+    /// At this length in bytes.
     Bytes(u64),
     /// After this time.
     Time(Duration),
 }
 
 impl Split {
-    /// What `text` says: a duration as `1h`, or a size as `512MiB` or `2GB`.
-    ///
-    /// The error says what would be right.
-    pub fn parse(text: &str) -> Result<Split, String> {
+    /// Parses a duration like `1h`, or a size like `512MiB` or `2GB`. The error is for the user.
+    pub(super) fn parse(text: &str) -> Result<Split, String> {
         let unit = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
         let (number, unit) = text.split_at(unit);
         let Some((_, factor)) = UNITS.iter().find(|(name, _)| *name == unit) else {
@@ -62,7 +59,7 @@ const UNITS: [(&str, u64); 8] = [
     ("GiB", 1 << 30),
     ("TiB", 1 << 40),
 ];
-/// Half of it is what every file says of its topics.
+/// Half of it describes the topics.
 const SMALLEST: u64 = 128 << 10;
 const LARGEST: u64 = 1 << 50;
 const SHORTEST: Duration = Duration::from_secs(1);
@@ -73,9 +70,9 @@ pub(super) struct Files {
     is_split: bool,
     overwrites: bool,
     keep: Option<usize>,
-    /// The last number that a name has.
+    /// Number in the last name.
     number: u32,
-    /// How many it has made.
+    /// Number of files of this run.
     count: u32,
     /// Text near the beginning of each file of this run, and of no other file.
     run: String,
@@ -100,9 +97,11 @@ impl Files {
         Files { path, is_split, overwrites, keep, number: 0, count: 0, run, made, older }
     }
 
-    /// The first one.
+    /// Makes the first file.
     ///
-    /// [`ErrorKind::AlreadyExists`] if something is in the way, [`ErrorKind::ResourceBusy`] if another run writes it.
+    /// # Errors
+    ///
+    /// [`ErrorKind::AlreadyExists`] if a file exists, [`ErrorKind::ResourceBusy`] if another run writes it.
     pub(super) fn first(&mut self) -> io::Result<(PathBuf, File)> {
         let existing = if self.is_split { self.existing() } else { Vec::new() };
         let last = existing.last().copied().unwrap_or(0);
@@ -118,7 +117,7 @@ impl Files {
         self.make(last + 1, self.overwrites && !self.is_split)
     }
 
-    /// The next one: a name that another run has taken is passed over.
+    /// Makes the next file. Skips a name that another run has taken.
     pub(super) fn next(&mut self) -> io::Result<(PathBuf, File)> {
         let mut number = self.number + 1;
         loop {
@@ -161,7 +160,7 @@ impl Files {
         (self.older.len() + self.made.len()).saturating_sub(keep)
     }
 
-    /// How many it has made.
+    /// Returns the number of files of this run.
     pub(super) fn count(&self) -> u32 {
         self.count
     }
@@ -182,7 +181,7 @@ impl Files {
         self.path.with_file_name(format!("{stem}-{number:04}{ending}"))
     }
 
-    /// What stands before and behind a number.
+    /// Returns the text before and after the number in a name.
     fn around(&self) -> (String, String) {
         let stem = self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let ending = self.path.extension().map(|ending| format!(".{}", ending.to_string_lossy()));
@@ -197,7 +196,7 @@ impl Files {
         let names = entries.flatten().map(|entry| entry.file_name());
         let number = |name: &str| {
             let digits = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&ending)?;
-            // Longer ones are dates.
+            // Longer numbers are dates.
             let number = digits.parse().ok().filter(|number| *number < 1_000_000)?;
             (format!("{number:04}") == digits).then_some(number)
         };
@@ -234,7 +233,7 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
         return Err(ErrorKind::InvalidInput.into());
     }
     // Another recorder could write the file between a look and the lock.
-    let is_taken = lock::is_taken(&file);
+    let is_taken = is_taken(&file);
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head)?;
     Ok((file, head, is_taken))
@@ -244,14 +243,14 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
 fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     let target = Target::open(path).map_err(|failure| io::Error::other(failure.message))?;
     let mut file = target.create(overwrites)?;
-    lock::take(&file)?;
+    take_lock(&file)?;
     // Another run may remove it as an old file between the open and the lock.
     for _ in 0..TRIES {
         if is_at(&file, path) {
             break;
         }
         file = target.create(overwrites)?;
-        lock::take(&file)?;
+        take_lock(&file)?;
     }
     file.set_len(0)?;
     Ok(file)
@@ -267,31 +266,70 @@ fn is_at(file: &File, path: &Path) -> bool {
 /// Opens of a file that other runs remove at the same time. Some file systems never report the same inode twice.
 const TRIES: usize = 3;
 
+/// Locks `file` for this process until it is closed, because two writers would overwrite each other.
+///
+/// # Errors
+///
+/// [`ErrorKind::ResourceBusy`] if another process has it. A file system without locks is no error.
+fn take_lock(file: &File) -> io::Result<()> {
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            let who = holder(file).map_or(String::new(), |pid| format!(" (process {pid})"));
+            Err(io::Error::new(ErrorKind::ResourceBusy, format!("another recorder writes it{who}")))
+        }
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(()),
+    }
+}
+
+/// Returns whether a process has taken `file`, or `None` if the file system has no locks.
+fn is_taken(file: &File) -> Option<bool> {
+    // A shared lock needs no write permission. It is released when `file` is closed.
+    match file.try_lock_shared() {
+        Ok(()) => Some(false),
+        Err(TryLockError::WouldBlock) => Some(true),
+        Err(TryLockError::Error(_)) => None,
+    }
+}
+
+/// Returns the process that has locked `file`, if the kernel reports it.
+fn holder(file: &File) -> Option<u32> {
+    let place = file.metadata().ok()?;
+    let id = format!("{:02x}:{:02x}:{}", major(place.dev()), minor(place.dev()), place.ino());
+    let locks = fs::read_to_string("/proc/locks").ok()?;
+    let words = locks.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
+    let words = words.into_iter().find(|words| words.get(PLACE) == Some(&id.as_str()))?;
+    words[PROCESS].parse().ok().filter(|pid| *pid > 0)
+}
+
+/// Words of a line of /proc/locks: `1: FLOCK ADVISORY WRITE 4711 08:01:131 0 EOF`.
+const PROCESS: usize = 4;
+const PLACE: usize = 5;
+
 /// Bytes that contain the description of the run, which is the first record of a recording.
 const HEAD: u64 = 4096;
-/// Somebody else has the name.
+/// Errors if another run has the name.
 const TAKEN: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
-/// Removes the file that was made at `path`, if it is one: devices and links are others' things.
+/// Removes the file that was made at `path`, unless it is a device or a link.
 pub(super) fn discard(path: &Path) {
     if fs::symlink_metadata(path).is_ok_and(|place| place.is_file()) {
         let _ = fs::remove_file(path);
     }
 }
 
-/// The name of a recording that was begun at `wall_ns` and given none.
-pub(super) fn usual_name(wall_ns: u64) -> PathBuf {
+/// Returns the default name of a recording that starts at `wall_ns`.
+pub(super) fn default_name(wall_ns: u64) -> PathBuf {
     let [year, month, day, hour, minute, second] = utc(wall_ns);
     format!("scanhub-{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}.mcap").into()
 }
 
-/// `wall_ns` as ISO 8601 has it, to the second.
+/// Formats `wall_ns` by ISO 8601, to the second.
 pub(super) fn iso(wall_ns: u64) -> String {
     let [year, month, day, hour, minute, second] = utc(wall_ns);
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
-/// Year, month, day, hour, minute and second of a time in ns since 1970, in the Gregorian calendar.
+/// Returns year, month, day, hour, minute and second of a time in ns since 1970, in the Gregorian calendar.
 fn utc(wall_ns: u64) -> [u64; 6] {
     let seconds = wall_ns / 1_000_000_000;
     let (mut day, time) = (seconds / DAY, seconds % DAY);
@@ -341,7 +379,7 @@ mod tests {
         assert_eq!(at(1_709_251_199), "2024-02-29T23:59:59Z");
         assert_eq!(at(1_798_761_599), "2026-12-31T23:59:59Z");
         assert_eq!(at(4_107_542_400), "2100-03-01T00:00:00Z");
-        assert_eq!(usual_name(1_700_000_000_000_000_000), Path::new("scanhub-20231114-221320.mcap"));
+        assert_eq!(default_name(1_700_000_000_000_000_000), Path::new("scanhub-20231114-221320.mcap"));
     }
 
     /// The beginning of a file that `run` wrote.
@@ -370,7 +408,7 @@ mod tests {
         fs::create_dir(at("walk-0006.mcap")).unwrap();
         let written = File::create(at("walk-0007.mcap")).unwrap();
         fs::write(at("walk-0007.mcap"), recording("run 0")).unwrap();
-        lock::take(&written).unwrap();
+        take_lock(&written).unwrap();
         for other in ["walk-fast-0001.mcap", "walk-20261122.mcap", "walk.mcap", "walk-0001.bag"] {
             fs::write(at(other), recording("run 1")).unwrap();
         }
@@ -421,7 +459,7 @@ mod tests {
         files.first().unwrap();
         assert_eq!(files.surplus_older(), 1);
         let other = File::open(&path).unwrap();
-        lock::take(&other).unwrap();
+        take_lock(&other).unwrap();
         files.prune();
         assert!(path.exists());
     }

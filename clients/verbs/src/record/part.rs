@@ -1,5 +1,5 @@
-//! One file of a recording. Each chunk is made in memory and then written: if the disk refuses it, it is written
-//! again, so the file always has a whole number of chunks. Refuses to know when to write.
+//! One file of a recording. Each chunk is made in memory and then written. If the disk refuses it, it is written again, so the
+//! file always has a whole number of chunks.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -14,7 +14,6 @@ use scanhub_schema::datagram::Packed;
 use scanhub_schema::file::{Compression, Writer};
 use scanhub_schema::{Header, Scan, Status, Topic};
 
-use super::Kept;
 use super::queue::{Batch, Entry, Gap};
 use crate::names::TopicName;
 
@@ -47,6 +46,13 @@ pub(super) struct Part {
     /// Of a recording for ROS 2.
     bag: Option<Bag>,
     scan: Box<Scan>,
+}
+
+/// A status that is repeated in the next file.
+pub(super) struct Kept {
+    pub(super) came_at: Instant,
+    pub(super) header: Header,
+    pub(super) payload: Vec<u8>,
 }
 
 /// How a file is written.

@@ -1,7 +1,9 @@
-//! Samples that were received and are in no file yet. The queue is bounded, so that a stalled disk costs samples and
-//! not memory; the writer takes all of it at once, so that the receiver never waits. Refuses to know disks and file
-//! formats.
+//! Exchange between the receiving thread and the disk thread: samples in one direction, progress in the other.
+//!
+//! The queue is bounded, so a stalled disk costs samples and not memory. The disk thread takes the whole queue at once, so the
+//! receiving thread never waits.
 
+use std::path::PathBuf;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -9,7 +11,7 @@ use scanhub_schema::Header;
 
 use crate::names::TopicName;
 
-/// Between the thread that receives and the one that writes.
+/// Samples that were received and are in no file yet.
 pub(super) struct Queue {
     waiting: Mutex<Waiting>,
     over: Condvar,
@@ -20,45 +22,44 @@ struct Waiting {
     is_over: bool,
 }
 
-/// What waits, in its order. Used again and again.
+/// Entries in their order. Its memory is reused.
 pub(super) struct Batch {
     pub(super) entries: Vec<Entry>,
-    /// The payloads of the samples, one behind the other, packed as for a network.
+    /// Payloads of the samples in the same order, packed as for a network.
     pub(super) bytes: Vec<u8>,
 }
 
-/// One thing to be kept.
+/// Entry of the queue.
 pub(super) enum Entry {
-    /// From here on a topic is kept: a track; they are numbered from 0.
+    /// Starts a track: a topic of the recording. Tracks are numbered from 0.
     Track(TopicName),
-    /// A sample of a track, whose payload is the next `len` bytes.
+    /// Sample of a track. Its payload is the next `len` bytes.
     Sample { track: usize, header: Header, len: usize },
-    /// Here samples were left out.
+    /// Samples were left out here.
     Gap(Gap),
 }
 
-/// A time in which samples were left out, because there was no room for them.
+/// Time in which samples were left out, because the queue was full.
 #[derive(Clone, Debug)]
 pub(super) struct Gap {
-    /// The wall clock at its begin and its end, ns since 1970.
+    /// Start and end by the wall clock, in ns since 1970.
     pub(super) from_ns: u64,
     pub(super) to_ns: u64,
-    /// How many, by topic.
+    /// Number of samples by topic.
     pub(super) left_out: Vec<(TopicName, u64)>,
 }
 
 impl Queue {
-    /// With room for what two sensors say in many seconds; memory is taken as it is used.
     pub(super) fn new() -> Queue {
         Queue { waiting: Mutex::new(Waiting { batch: Batch::new(), is_over: false }), over: Condvar::new() }
     }
 
-    /// Something that always has room, because there is little of it.
+    /// Adds an entry that always has room, because such entries are rare.
     pub(super) fn note(&self, entry: Entry) {
         self.lock().batch.entries.push(entry);
     }
 
-    /// Adds a sample of `track`, whose payload of at most `longest` bytes `pack` writes; false if there is no room.
+    /// Adds a sample of `track`, whose payload of at most `longest` bytes `pack` writes. Returns false if there is no room.
     pub(super) fn push(
         &self,
         track: usize,
@@ -80,34 +81,33 @@ impl Queue {
         true
     }
 
-    /// Nothing waits.
     pub(super) fn is_empty(&self) -> bool {
         self.lock().batch.entries.is_empty()
     }
 
-    /// At least half of the room is free.
+    /// Returns whether at least half of the room is free.
     pub(super) fn is_roomy(&self) -> bool {
         let Batch { entries, bytes } = &self.lock().batch;
         entries.len() < MOST_ENTRIES / 2 && bytes.len() < MOST_BYTES / 2
     }
 
-    /// Nothing more comes.
+    /// Ends the queue: nothing is added from now on.
     pub(super) fn end(&self) {
         self.lock().is_over = true;
         self.over.notify_all();
     }
 
-    /// Waits until `until`, or that nothing more comes, which it answers.
+    /// Waits until `until` or the end of the queue. Returns whether it has ended.
     pub(super) fn wait(&self, until: Instant) -> bool {
         let left = until.saturating_duration_since(Instant::now());
         let waiting = self.over.wait_timeout_while(self.lock(), left, |waiting| !waiting.is_over);
         waiting.unwrap_or_else(PoisonError::into_inner).0.is_over
     }
 
-    /// Exchanges all that waits for `empty`, which gets it.
-    pub(super) fn take(&self, empty: &mut Batch) {
-        empty.clear();
-        std::mem::swap(&mut self.lock().batch, empty);
+    /// Moves all entries to `batch`.
+    pub(super) fn take(&self, batch: &mut Batch) {
+        batch.clear();
+        std::mem::swap(&mut self.lock().batch, batch);
     }
 
     fn lock(&self) -> MutexGuard<'_, Waiting> {
@@ -125,12 +125,12 @@ impl Batch {
         self.bytes.clear();
     }
 
-    /// How many samples there are.
+    /// Returns the number of samples.
     pub(super) fn count(&self) -> u64 {
         self.samples().count() as u64
     }
 
-    /// Each sample's track, header and payload.
+    /// Returns track, header and payload of each sample.
     pub(super) fn samples(&self) -> impl Iterator<Item = (usize, &Header, &[u8])> {
         let mut begin = 0;
         self.entries.iter().filter_map(move |entry| {
@@ -141,11 +141,55 @@ impl Batch {
     }
 }
 
-/// Of payloads, in bytes: 20 seconds of all topics of two sensors at their fastest.
+/// Progress of the disk thread, for the receiving thread.
+#[derive(Default)]
+pub(super) struct WriterProgress(Mutex<RecordStats>);
+
+/// Progress and news.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct RecordStats {
+    /// Bytes in all files that still exist.
+    pub(super) bytes: u64,
+    /// Samples in all files that still exist.
+    pub(super) samples: u64,
+    /// Events since the receiving thread last read them.
+    pub(super) news: Vec<News>,
+}
+
+/// Event of the disk thread.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum News {
+    /// The recording continues in this file.
+    File(PathBuf),
+    /// The file cannot be written, for this reason.
+    Trouble(PathBuf, String),
+    /// The file can be written again, after this time.
+    Well(PathBuf, Duration),
+    /// This number of samples was lost, because the file was removed or cut.
+    Gone(PathBuf, u64),
+    /// The reader of stdout went away.
+    ReaderGone,
+}
+
+impl WriterProgress {
+    /// Returns the progress, and takes the news.
+    pub(super) fn look(&self) -> RecordStats {
+        let mut stats = self.stats();
+        let news = std::mem::take(&mut stats.news);
+        RecordStats { news, ..stats.clone() }
+    }
+
+    /// Locks the progress for the disk thread.
+    pub(super) fn stats(&self) -> MutexGuard<'_, RecordStats> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Bytes of payloads: 20 seconds of all topics of two sensors at their fastest.
 const MOST_BYTES: usize = 8 << 20;
 const MOST_ENTRIES: usize = 1 << 15;
-/// So often what waits is written and a chunk is closed: what a kill costs is not older.
-pub(super) const EVERY: Duration = Duration::from_millis(100);
+/// Interval at which the queue is written and a chunk is closed. A kill costs no more than this.
+pub(super) const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
 mod tests {

@@ -1,5 +1,4 @@
-//! The reports of a recorder: lines of JSON, or text with one progress line that is redrawn. Refuses to know the
-//! reasons.
+//! The reports of a recorder: lines of JSON, or text with one progress line that is redrawn.
 
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
@@ -9,18 +8,27 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::RecordLook;
-use super::queue::Gap;
-use super::writer_progress::{News, RecordStats};
+use super::queue::{Gap, News, RecordStats};
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::output::{End, Output, columns, fitting};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, text};
 
+/// Form of the reports.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Look {
+    /// Lines of text at the start, at the end, and for events.
+    Lines,
+    /// JSON objects, also once a second.
+    Json,
+    /// A line of progress that is redrawn.
+    Terminal,
+}
+
 /// Where the reports go.
 pub(super) struct Report<'a> {
-    look: RecordLook,
+    look: Look,
     out: Output<'a>,
     notes: Output<'a>,
     /// Where the line is drawn, to ask how long it may be.
@@ -43,7 +51,7 @@ const EVERY: Duration = Duration::from_secs(1);
 impl<'a> Report<'a> {
     /// Accounts to `out`, which may be `terminal`, and what is no account to `notes` if `out` is not JSON.
     pub(super) fn new(
-        look: RecordLook,
+        look: Look,
         out: &'a mut dyn Write,
         notes: &'a mut dyn Write,
         terminal: Option<OwnedFd>,
@@ -67,7 +75,7 @@ impl<'a> Report<'a> {
     /// Writes the first line: the file at `path`, and how many files of earlier runs are removed once it has samples.
     pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), End> {
         self.files.push(path.to_owned());
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             let first = Progress { older_removed: Some(older), ..self.at(&RecordStats::default(), 0) };
             return self.out.json(&first);
         }
@@ -86,7 +94,7 @@ impl<'a> Report<'a> {
         if let Notice::Missed(missed) = notice {
             self.lost += missed;
         }
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             return json::notices(&mut self.out, names, &notice);
         }
         self.note(|line| text::notice(line, names, &notice))
@@ -104,7 +112,7 @@ impl<'a> Report<'a> {
             News::Gone(_, samples) => self.gone += samples,
             _ => {}
         }
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             let of = |kind, path: &Path| Disk {
                 class: "notice",
                 kind,
@@ -145,7 +153,7 @@ impl<'a> Report<'a> {
 
     /// From here on samples are left out.
     pub(super) fn gap_begins(&mut self) -> Result<(), End> {
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             let (left_out, seconds) = (0, 0.0);
             return self.out.json(&Left { class: "notice", kind: "gap_begins", left_out, seconds });
         }
@@ -156,7 +164,7 @@ impl<'a> Report<'a> {
     pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), End> {
         let left_out = gap.left_out.iter().map(|(_, count)| count).sum();
         let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             return self.out.json(&Left { class: "notice", kind: "gap_ends", left_out, seconds });
         }
         self.note(|line| {
@@ -175,12 +183,12 @@ impl<'a> Report<'a> {
         }
         self.next = Instant::now() + EVERY;
         match self.look {
-            RecordLook::Lines => Ok(()),
-            RecordLook::Json => {
+            Look::Lines => Ok(()),
+            Look::Json => {
                 let progress = self.at(written, left_out);
                 self.out.json(&progress)
             }
-            RecordLook::Terminal => {
+            Look::Terminal => {
                 // A line that wraps would not be drawn over: one that does not fit all the same is cut.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
                 let status = fitting(self.status(written, left_out), columns);
@@ -193,7 +201,7 @@ impl<'a> Report<'a> {
 
     /// What was received of a topic.
     pub(super) fn topic(&mut self, name: &TopicName, account: &ReceiveStats) -> Result<(), End> {
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             return self.out.json(&json::summary(name, account));
         }
         self.wipe()?;
@@ -203,7 +211,7 @@ impl<'a> Report<'a> {
     /// All of it is written.
     pub(super) fn end(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
         let RecordStats { bytes, samples, .. } = *written;
-        if self.look == RecordLook::Json {
+        if self.look == Look::Json {
             return self.out.json(&Recorded {
                 class: "recorded",
                 files: self.files.iter().map(|file| file.display().to_string()).collect(),
@@ -270,8 +278,8 @@ impl<'a> Report<'a> {
 
     fn wipe(&mut self) -> Result<(), End> {
         match self.look {
-            RecordLook::Terminal => self.out.raw(WIPE),
-            RecordLook::Json | RecordLook::Lines => Ok(()),
+            Look::Terminal => self.out.raw(WIPE),
+            Look::Json | Look::Lines => Ok(()),
         }
     }
 }
