@@ -15,7 +15,7 @@ use super::part::{Kept, Part, Place, Style};
 use super::queue::{Batch, Entry, News, Queue, WRITE_INTERVAL, WriterProgress};
 use crate::names::TopicName;
 
-/// The writing of one run.
+/// State of the disk thread of one run.
 pub(super) struct Disk {
     queue: Arc<Queue>,
     progress: Arc<WriterProgress>,
@@ -25,11 +25,11 @@ pub(super) struct Disk {
     style: Style,
     part: Part,
     tracks: Vec<TopicName>,
-    /// The last one of each track of that topic.
+    /// Last status of each track of that topic, for the start of the next file.
     statuses: Vec<Option<Kept>>,
-    /// What is being written; kept until it is.
+    /// Entries that are being written. They stay here until the disk has them.
     batch: Batch,
-    /// Bytes and samples of the files before.
+    /// Bytes of the files before.
     bytes: u64,
     /// Whether a sample was written. Before that, no older file is removed: a run without a hub must not cost one.
     has_samples: bool,
@@ -38,7 +38,7 @@ pub(super) struct Disk {
     most_index: usize,
 }
 
-/// Something cannot be written.
+/// State while the disk cannot be written.
 struct Trouble {
     since: Instant,
     retry_at: Instant,
@@ -46,8 +46,7 @@ struct Trouble {
 }
 
 impl Disk {
-    /// Begins the first file, so that it is known at once if there is none to be had: with `files` where these say, else
-    /// into `stream`.
+    /// Starts the first file, or the stream instead of files. An error at the start ends the run at once.
     pub(super) fn begin(
         queue: Arc<Queue>,
         files: Result<Files, File>,
@@ -63,7 +62,7 @@ impl Disk {
             Err(stream) => (None, Place::Stream(stream)),
         };
         let mut part = Part::begin(place, style, numbered(&facts, files.as_ref()))?;
-        // What could not even be begun is not in the way of the next try.
+        // A file that could not be started must not block the next try.
         part.write().inspect_err(|_| part.path().into_iter().for_each(discard))?;
         let progress = WriterProgress::default();
         progress.stats().bytes = part.written;
@@ -86,7 +85,6 @@ impl Disk {
         })
     }
 
-    /// Where it says how far it came.
     pub(super) fn progress(&self) -> Arc<WriterProgress> {
         self.progress.clone()
     }
@@ -96,12 +94,12 @@ impl Disk {
         self.files.as_ref().map_or(0, Files::surplus_older)
     }
 
-    /// The name of the file that is being written.
+    /// Returns the name of the current file.
     pub(super) fn path(&self) -> PathBuf {
         self.part.path().map_or_else(|| "stdout".into(), PathBuf::from)
     }
 
-    /// Writes until nothing more comes and all of it is written. The error says why the end is missing.
+    /// Writes until the queue has ended and everything is written. The error is the reason why the end is missing.
     pub(super) fn run(mut self) -> io::Result<()> {
         let mut due = Instant::now();
         loop {
@@ -130,7 +128,7 @@ impl Disk {
         }
     }
 
-    /// Brings to the disk what could not be written before, and then what came since.
+    /// Writes first what could not be written before, and then what the queue received since.
     fn step(&mut self, now: Instant, is_over: bool) -> io::Result<()> {
         if self.trouble.is_some() && self.is_lost() {
             self.renew()?;
@@ -167,10 +165,10 @@ impl Disk {
         Ok(())
     }
 
-    /// It goes on in the next file. One in which nothing came lasts: nobody wants it in place of one that is kept.
+    /// Returns whether the next file is due. A file without samples stays open, because the next one could replace a kept file.
     fn is_full(&self, now: Instant) -> bool {
         let is_split = match self.split {
-            // It is finished before it is too long, where its index leaves it some room.
+            // The file ends before it is too long, unless its index takes half of it.
             Some(Split::Bytes(most)) => {
                 self.part.begun.is_some() && self.part.written >= most / 2 && self.part.next_len() > most
             }
@@ -182,7 +180,7 @@ impl Disk {
         is_split || self.part.index >= self.most_index
     }
 
-    /// Writes what was made; then the batch is on the disk.
+    /// Writes the chunk of the batch, counts its samples, and empties the batch.
     fn write(&mut self) -> io::Result<()> {
         self.part.write()?;
         self.remember();
@@ -199,13 +197,13 @@ impl Disk {
         Ok(())
     }
 
-    /// The file that is there takes nothing any more, whatever becomes of the disk.
+    /// Returns whether the current file cannot be continued, even if the disk recovers.
     fn is_lost(&self) -> bool {
         let is_too_large = self.trouble.as_ref().is_some_and(|trouble| trouble.is_too_large);
         self.files.is_some() && (self.part.look().is_err() || (is_too_large && self.part.written > 0))
     }
 
-    /// Goes on in the next file, with the batch that is not written yet.
+    /// Starts the next file, with the batch that is not written yet.
     fn renew(&mut self) -> io::Result<()> {
         let Some(files) = &mut self.files else { return Ok(()) };
         let (path, file) = files.next()?;
@@ -229,7 +227,7 @@ impl Disk {
         }
     }
 
-    /// What was written to a file that is gone is in none.
+    /// Subtracts the samples of a file that was removed or cut.
     fn count_gone(&mut self) {
         let Some(path) = self.part.path().filter(|_| self.part.is_gone()).map(PathBuf::from) else { return };
         let samples = std::mem::take(&mut self.part.samples);
@@ -268,7 +266,7 @@ impl Disk {
         if self.trouble.is_none() {
             self.progress.stats().news.push(News::Trouble(self.path(), error.to_string()));
         }
-        // What another file may help is tried at once.
+        // If another file may help, the next try is at once.
         let is_first = self.trouble.is_none();
         let since = self.trouble.as_ref().map_or(now, |trouble| trouble.since);
         self.trouble = Some(Trouble { since, retry_at: now, is_too_large });
@@ -285,18 +283,18 @@ impl Disk {
     }
 }
 
-/// The report of a run, with the number of the file within the run.
+/// Returns the description of the run, with the number of the file in the run.
 fn numbered(facts: &BTreeMap<String, String>, files: Option<&Files>) -> BTreeMap<String, String> {
     let mut facts = facts.clone();
     facts.insert("part".to_owned(), files.map_or(1, Files::count).to_string());
     facts
 }
 
-/// The index of a file stays in memory until the file is finished, which takes twice as much again, in bytes.
+/// Maximum memory for the index of a file, in bytes. Finishing the file takes twice as much again.
 const MOST_INDEX: usize = 128 << 20;
-/// So often a disk that takes nothing is tried.
+/// Interval at which a disk that fails is tried again.
 const RETRY_EVERY: Duration = Duration::from_secs(1);
-/// So often it is seen that a file was taken away.
+/// Interval at which the current file is checked for removal.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 #[cfg(test)]

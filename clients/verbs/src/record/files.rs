@@ -270,7 +270,7 @@ const TRIES: usize = 3;
 ///
 /// # Errors
 ///
-/// [`ErrorKind::ResourceBusy`] if another process has it. A file system without locks is no error.
+/// [`ErrorKind::ResourceBusy`] if another process has it. Succeeds if the file system has no locks.
 fn take_lock(file: &File) -> io::Result<()> {
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => {

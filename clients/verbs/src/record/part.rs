@@ -22,28 +22,28 @@ pub(super) struct Part {
     writer: Option<Writer<Made>>,
     made: Made,
     place: Place,
-    /// Bytes of what was made that a stream has taken already: it cannot take them back.
+    /// Bytes of `made` that a stream has taken already. They cannot be taken back.
     taken: usize,
     /// Bytes that are in the file.
     pub(super) written: u64,
     /// Samples that are in the file, without those that are repeated.
     pub(super) samples: u64,
-    /// When its first own sample came.
+    /// Arrival of its first sample, apart from those that are repeated.
     pub(super) begun: Option<Instant>,
-    /// About how much memory its index takes, in bytes.
+    /// Approximate memory of its index, in bytes.
     pub(super) index: usize,
-    /// About how long its index will be in the file, in bytes.
+    /// Approximate length of its index in the file, in bytes.
     end: u64,
-    /// How much was written last, in bytes.
+    /// Length of the last write, in bytes.
     last: u64,
-    /// The disk did not have all of it, when it was asked.
+    /// Whether a sync failed, so that data may be missing on the disk.
     pub(super) is_doubtful: bool,
-    /// What was said last of which life of a sensor's hub.
+    /// Boot numbers of the hubs that the file describes.
     lives: Vec<u64>,
-    /// Topics and tracks that are in it.
+    /// Topics and tracks in the file.
     topics: Vec<Topic>,
     met: Vec<usize>,
-    /// Of a recording for ROS 2.
+    /// Only in a recording for ROS 2.
     bag: Option<Bag>,
     scan: Box<Scan>,
 }
@@ -55,19 +55,19 @@ pub(super) struct Kept {
     pub(super) payload: Vec<u8>,
 }
 
-/// How a file is written.
+/// Form of a file.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
     pub(super) form: Form,
     pub(super) compression: Compression,
 }
 
-/// What the messages are.
+/// Form of the messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Form {
-    /// As the hub publishes them.
+    /// Samples as the hub publishes them.
     Hub,
-    /// Those of ROS 2, and no other.
+    /// Only messages of ROS 2.
     Ros2,
 }
 
@@ -80,15 +80,15 @@ impl Form {
     }
 }
 
-/// Where the bytes go.
+/// Destination of the bytes.
 pub(super) enum Place {
     /// A file and its name.
     File(File, PathBuf),
-    /// Something that only takes bytes one after the other.
+    /// Stdout, for example a pipe.
     Stream(File),
 }
 
-/// What was made and is not written yet.
+/// Bytes that are made and not written yet.
 #[derive(Clone, Default)]
 struct Made(Arc<Mutex<Vec<u8>>>);
 
@@ -104,7 +104,7 @@ impl Write for Made {
 }
 
 impl Part {
-    /// A new one at `place`, of which `facts` are told; nothing is written yet.
+    /// Makes the start of a file, with `facts` on the run. Nothing is written yet.
     pub(super) fn begin(place: Place, style: Style, facts: BTreeMap<String, String>) -> io::Result<Part> {
         let made = Made::default();
         let writer = Some(Writer::packed(made.clone(), style.form.profile(), style.compression, facts)?);
@@ -128,8 +128,8 @@ impl Part {
         })
     }
 
-    /// The statuses that stand, by track, so that it can be played without what came before; not those of sensors that
-    /// said nothing any more while others did.
+    /// Repeats the last statuses, by track, so that the file can be played without those before. Leaves out sensors that are
+    /// silent while others send.
     pub(super) fn repeat(&mut self, tracks: &[TopicName], statuses: &[Option<Kept>]) -> io::Result<()> {
         let newest = statuses.iter().flatten().map(|kept| kept.came_at).max();
         for (at, kept) in statuses.iter().enumerate() {
@@ -165,7 +165,7 @@ impl Part {
         self.writer()?.close_chunk()
     }
 
-    /// Makes the index, behind which nothing comes.
+    /// Makes the index, which ends the file.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         match self.writer.take() {
             Some(writer) => writer.finish().map(drop),
@@ -173,13 +173,11 @@ impl Part {
         }
     }
 
-    /// Its end is made.
     pub(super) fn is_finished(&self) -> bool {
         self.writer.is_none()
     }
 
-    /// Writes what was made. After an error the file ends with the last chunk that is whole, and what was not written is
-    /// still there to be.
+    /// Writes what was made. After an error, the file ends with the last whole chunk, and the next call tries again.
     pub(super) fn write(&mut self) -> io::Result<()> {
         let mut made = self.made.0.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut self.place {
@@ -206,25 +204,26 @@ impl Part {
         Ok(())
     }
 
-    /// About how long the file will be if one more chunk comes before its end, in bytes: half as long again as the last one.
+    /// Returns the approximate length of the file after one more chunk and its end, in bytes. The chunk is assumed to be half as
+    /// long again as the last one.
     pub(super) fn next_len(&self) -> u64 {
         self.written + self.last * 3 / 2 + self.end
     }
 
-    /// Asks the disk to have all of it.
+    /// Waits until the disk has stored the file.
     pub(super) fn sync(&mut self) -> io::Result<()> {
         match &self.place {
             Place::Stream(_) => Ok(()),
             Place::File(file, _) => match file.sync_data() {
-                // Not every device keeps things.
+                // Not every device stores data.
                 Err(error) if error.kind() == ErrorKind::InvalidInput => Ok(()),
-                // Linux tells it once: asked again, it would say that all is well.
+                // Linux reports the error only once: the next sync would succeed.
                 synced => synced.inspect_err(|_| self.is_doubtful = true),
             },
         }
     }
 
-    /// Its name, if it has one.
+    /// Returns the name of the file, or `None` for a stream.
     pub(super) fn path(&self) -> Option<&Path> {
         match &self.place {
             Place::File(_, path) => Some(path),
@@ -232,7 +231,11 @@ impl Part {
         }
     }
 
-    /// [`ErrorKind::NotFound`] if the file is not to be found under its name any more, or not all of it.
+    /// Checks that the whole file still has its name.
+    ///
+    /// # Errors
+    ///
+    /// [`ErrorKind::NotFound`] if another file has the name, or the file was cut.
     pub(super) fn look(&self) -> io::Result<()> {
         let Place::File(file, path) = &self.place else { return Ok(()) };
         let (here, there) = (file.metadata()?, fs::metadata(path)?);
@@ -245,7 +248,7 @@ impl Part {
         Ok(())
     }
 
-    /// Nobody finds what was written any more: the file was removed, or cut. One that is elsewhere now has it still.
+    /// Returns whether the file was removed or cut. A file that was moved still has its samples.
     pub(super) fn is_gone(&self) -> bool {
         let Place::File(file, _) = &self.place else { return false };
         file.metadata().is_ok_and(|here| here.is_file() && (here.nlink() == 0 || here.len() < self.written))
@@ -303,18 +306,17 @@ fn nothing_behind() -> io::Error {
     io::Error::other("nothing follows the index")
 }
 
-/// A status stands for so long, while others come: they do each second.
+/// A status is valid for this time while others arrive. Each sensor sends one a second.
 const STANDS: Duration = Duration::from_secs(60);
-/// What a chunk takes in the index in memory, and what each channel in it does, in bytes.
+/// Bytes in the index in memory: for a chunk, and for each channel in it.
 const INDEX_OF_CHUNK: usize = 200;
 const INDEX_OF_CHANNEL: usize = 24;
-/// What a chunk takes in the index in the file, what each channel in it does, a track, and a topic, whose type the index
-/// describes once more; in bytes.
+/// Bytes in the index in the file: for a chunk, each channel in it, a track, and a topic, whose type the index describes again.
 const END_OF_CHUNK: u64 = 70;
 const END_OF_CHANNEL: u64 = 10;
 const END_OF_TRACK: u64 = 100;
 const END_OF_TOPIC: u64 = 100 + scanhub_schema::file::LAYOUT.len() as u64;
-/// Name of the metadata record of a life of the hub, before its first sample.
+/// Name of the metadata record that precedes the first sample of a hub.
 const LIFE: &str = "scanhub.life";
 /// Name of the metadata record of samples that were left out.
 const GAP: &str = "scanhub.gap";

@@ -26,30 +26,30 @@ pub(super) enum Look {
     Terminal,
 }
 
-/// Where the reports go.
+/// Reports of a run, and the counts in them.
 pub(super) struct Report<'a> {
     look: Look,
     out: Output<'a>,
     notes: Output<'a>,
-    /// Where the line is drawn, to ask how long it may be.
+    /// The terminal of the progress line, for its width.
     terminal: Option<OwnedFd>,
     begun: Instant,
     next: Instant,
     files: Vec<PathBuf>,
-    /// Bytes at the last word.
+    /// Bytes in the last report of progress.
     bytes: u64,
     /// Samples that were sent and not received.
     lost: u64,
-    /// Samples that were written, and whose file is gone.
+    /// Samples whose file was removed or cut.
     gone: u64,
     is_in_trouble: bool,
 }
 
-/// Between two words about the progress.
+/// Interval between two reports of progress.
 const EVERY: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Accounts to `out`, which may be `terminal`, and what is no account to `notes` if `out` is not JSON.
+    /// Reports go to `out`, which may be `terminal`, and notices to `notes` if `out` is not JSON.
     pub(super) fn new(
         look: Look,
         out: &'a mut dyn Write,
@@ -89,7 +89,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// News of the hub, and of what was not received.
+    /// Reports news of the hub, and missed samples.
     pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if let Notice::Missed(missed) = notice {
             self.lost += missed;
@@ -100,7 +100,7 @@ impl<'a> Report<'a> {
         self.note(|line| text::notice(line, names, &notice))
     }
 
-    /// News of the disk.
+    /// Reports news of the disk thread.
     pub(super) fn disk(&mut self, news: &News) -> Result<(), End> {
         self.is_in_trouble = match news {
             News::Trouble(..) => true,
@@ -151,7 +151,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// From here on samples are left out.
+    /// Reports that samples are left out from now on.
     pub(super) fn gap_begins(&mut self) -> Result<(), End> {
         if self.look == Look::Json {
             let (left_out, seconds) = (0, 0.0);
@@ -160,7 +160,7 @@ impl<'a> Report<'a> {
         self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
-    /// Nothing more is left out.
+    /// Reports what a gap left out.
     pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), End> {
         let left_out = gap.left_out.iter().map(|(_, count)| count).sum();
         let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
@@ -176,7 +176,7 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// How far it is, once a second, to who looks or reads objects.
+    /// Reports the progress once a second, to a terminal or as JSON.
     pub(super) fn progress(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
         if Instant::now() < self.next {
             return Ok(());
@@ -189,7 +189,7 @@ impl<'a> Report<'a> {
                 self.out.json(&progress)
             }
             Look::Terminal => {
-                // A line that wraps would not be drawn over: one that does not fit all the same is cut.
+                // A line that wraps could not be redrawn, so the terminal cuts a line that is still too long.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
                 let status = fitting(self.status(written, left_out), columns);
                 let line = [WIPE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
@@ -199,7 +199,7 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// What was received of a topic.
+    /// Reports what was received of a topic.
     pub(super) fn topic(&mut self, name: &TopicName, account: &ReceiveStats) -> Result<(), End> {
         if self.look == Look::Json {
             return self.out.json(&json::summary(name, account));
@@ -208,7 +208,7 @@ impl<'a> Report<'a> {
         self.out.line(|line| text::summary(line, name, account))
     }
 
-    /// All of it is written.
+    /// Reports the finished recording.
     pub(super) fn end(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
         let RecordStats { bytes, samples, .. } = *written;
         if self.look == Look::Json {
@@ -255,7 +255,7 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// How far it is, each part with its rank: what is lost is wanted longest.
+    /// Returns the progress in parts with their ranks. Lost samples have the highest rank.
     fn status(&self, written: &RecordStats, left_out: u64) -> Vec<(u8, String)> {
         let seconds = self.begun.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
@@ -270,7 +270,7 @@ impl<'a> Report<'a> {
         trouble.into_iter().chain(parts).collect()
     }
 
-    /// A line that is no account.
+    /// Writes a notice.
     fn note(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
         self.wipe()?;
         self.notes.line(build)
@@ -284,7 +284,7 @@ impl<'a> Report<'a> {
     }
 }
 
-/// `bytes` for people.
+/// Formats a size in bytes for users.
 fn size(bytes: u64) -> String {
     let units = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
     match units.into_iter().find(|(_, bits)| bytes >> bits > 0) {
@@ -293,7 +293,7 @@ fn size(bytes: u64) -> String {
     }
 }
 
-/// Class `recording`: how far it is.
+/// Line of class `recording`.
 #[derive(Serialize)]
 struct Progress {
     class: &'static str,
@@ -308,7 +308,7 @@ struct Progress {
     older_removed: Option<usize>,
 }
 
-/// Class `recorded`: the last line.
+/// Line of class `recorded`, the last one.
 #[derive(Serialize)]
 struct Recorded {
     class: &'static str,
@@ -321,7 +321,7 @@ struct Recorded {
     seconds: f64,
 }
 
-/// Class `notice`, of the disk.
+/// Line of class `notice` on the disk.
 #[derive(Serialize)]
 struct Disk<'a> {
     class: &'static str,
@@ -335,7 +335,7 @@ struct Disk<'a> {
     samples: Option<u64>,
 }
 
-/// Class `notice`, of samples left out.
+/// Line of class `notice` on samples that were left out.
 #[derive(Serialize)]
 struct Left {
     class: &'static str,
@@ -344,7 +344,7 @@ struct Left {
     seconds: f64,
 }
 
-/// To the line's begin, and nothing on it (ECMA-48).
+/// Moves the cursor to the start of the line, and erases it (ECMA-48).
 const WIPE: &[u8] = b"\r\x1b[K";
 
 #[cfg(test)]
