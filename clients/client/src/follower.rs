@@ -1,13 +1,12 @@
-//! One topic of one sensor, sample by sample, with a count of missed samples. Continues by itself when the hub is
-//! replaced. Never waits: the session does that.
+//! Receives one topic of one sensor, sample by sample, and counts missed samples by their sequence numbers. It
+//! continues by itself when the hub is replaced. It never waits: the session does that.
 
 use std::ops::Deref;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Header, Kind, Scan};
+use scanhub_schema::{Failure, Flags, Header, Kind, Scan};
 use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber};
 
-use crate::numbers::{Noted, Numbers};
 use crate::session::Session;
 
 /// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four at a time, and none
@@ -37,7 +36,8 @@ impl<P: Payload + ?Sized> Deref for Received<P> {
 }
 
 impl Received<Scan> {
-    /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is older.
+    /// Returns CLOCK_MONOTONIC when beam `i` was measured, in ns: stamps are of bytes on the wire, the measurement is
+    /// older.
     pub fn beam_time_ns(&self, i: usize) -> u64 {
         self.header().stamp_first_ns.saturating_add_signed(self.beam_ns(i))
     }
@@ -50,18 +50,18 @@ pub struct Follower<P: Payload + ?Sized> {
     asked_at: Option<Instant>,
     numbers: Numbers,
     unconnected_since: Option<Instant>,
-    /// In this moment there was nothing.
+    /// Moment of the session in which no sample had arrived.
     nothing_at: Option<(u32, Instant)>,
 }
 
-/// How often a topic that is not there is asked for.
+/// Interval of the attempts to open a topic that does not exist yet.
 const ASK_EVERY: Duration = Duration::from_millis(50);
 
-/// A publisher that cannot be connected to for this long is not just dying.
+/// Time after which a failure to connect to a publisher is reported. While a hub exits, such failures are normal.
 const UNCONNECTED_LIMIT: Duration = Duration::from_secs(3);
 
 impl<P: Payload + ?Sized> Follower<P> {
-    /// Makes what will follow the topic of `sensor`, as soon as it is there.
+    /// Creates a follower of the topic of `sensor`, which may not exist yet.
     pub fn new(sensor: &str) -> Follower<P> {
         Follower {
             sensor: sensor.to_owned(),
@@ -78,7 +78,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         self.port.is_some()
     }
 
-    /// Returns the next sample that waits, or nothing.
+    /// Returns the next sample that has arrived.
     ///
     /// # Errors
     ///
@@ -106,7 +106,7 @@ impl<P: Payload + ?Sized> Follower<P> {
                 "more than four samples are held",
                 "drop them before the next one",
             )),
-            // Seen while a killed hub's memory is being removed; what stays so is a shortage.
+            // Occurs while the memory of a killed hub is being removed. If it persists, it is a shortage.
             Err(ReceiveError::ConnectionFailure(error)) => {
                 let since = *self.unconnected_since.get_or_insert_with(Instant::now);
                 if since.elapsed() < UNCONNECTED_LIMIT {
@@ -138,5 +138,64 @@ impl<P: Payload + ?Sized> Follower<P> {
     fn account(&mut self, sample: Sample<P>) -> Received<P> {
         let Noted { missed, restarted } = self.numbers.note(sample.user_header());
         Received { sample, missed, restarted }
+    }
+}
+
+/// Sequence numbers of one topic of one sensor, as one subscriber receives them.
+#[derive(Clone, Debug, Default)]
+pub struct Numbers {
+    boot: Option<u64>,
+    expected: Option<u64>,
+}
+
+/// Result of comparing the number of a sample with the one before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Noted {
+    /// Samples of this topic that were sent before this one and not received.
+    pub missed: u64,
+    /// The hub was restarted since the last sample: its numbers start again at 0.
+    pub restarted: bool,
+}
+
+impl Numbers {
+    /// Continues at the number of the next sample, because the port is a new one.
+    pub fn begin_anew(&mut self) {
+        self.expected = None;
+    }
+
+    /// Takes the sample with `header`. A port that was open before the hub started receives the hub's samples from
+    /// number 0; a new port starts at any number.
+    pub fn note(&mut self, header: &Header) -> Noted {
+        let restarted = self.boot.is_some_and(|boot| boot != header.boot);
+        // Numbers of remote topics continue when the hub on the other machine restarts.
+        let is_remote = header.flags & Flags::REMOTE != 0;
+        if restarted && !is_remote && self.expected.is_some() {
+            self.expected = Some(0);
+        }
+        let missed = self.expected.map_or(0, |expected| header.topic_seq.saturating_sub(expected));
+        self.boot = Some(header.boot);
+        self.expected = Some(header.topic_seq + 1);
+        Noted { missed, restarted }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaps_count_and_another_hub_begins_at_0() {
+        let mut numbers = Numbers::default();
+        let mut note = |boot, topic_seq, flags| {
+            let Noted { missed, restarted } =
+                numbers.note(&Header { boot, topic_seq, flags, ..Header::default() });
+            (missed, restarted)
+        };
+        assert_eq!((note(1, 7, 0), note(1, 8, 0), note(1, 11, 0)), ((0, false), (0, false), (2, false)));
+        assert_eq!((note(2, 3, 0), note(2, 4, 0)), ((3, true), (0, false)));
+        assert_eq!(note(3, 9, Flags::REMOTE), (4, true), "a network's numbers go on");
+        numbers.begin_anew();
+        let later = Header { boot: 3, topic_seq: 50, ..Header::default() };
+        assert_eq!(numbers.note(&later), Noted { missed: 0, restarted: false });
     }
 }

@@ -32,13 +32,9 @@
 pub mod clock;
 mod control;
 mod follower;
-mod freshness;
 mod join;
-mod live;
-mod numbers;
 mod presence;
 mod publish;
-mod readiness;
 mod robot;
 mod sample;
 mod session;
@@ -49,7 +45,7 @@ mod zones;
 
 pub use control::request;
 pub use follower::Received;
-pub use live::{live_sensors, live_topics};
+pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, home, publish};
 pub use robot::{Robot, RobotFollower, robot};
 pub use subscribe::{Subscription, places, subscribe};

@@ -1,5 +1,5 @@
-//! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a
-//! domain may be at; refuses to open anything there.
+//! Detects whether a hub or a listener runs in a domain, in which of its places, and which sensors and topics exist
+//! there. It queries the locks of the places.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Domain, Environment, RunningHub, holder, publisher};
 
-/// How often the locks are looked at.
+/// Interval of the queries of the locks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// Maximum number of hubs of other users or domains that a message names.
@@ -16,15 +16,15 @@ const MAX_HUBS: usize = 3;
 /// Remedy for a user who needs the data of another user's hub.
 const SHARING: &str = "to have its data under this user: docs/sharing.md";
 
-/// How often the locks are looked at although the hub is heard.
+/// Interval of the queries of the locks while the hub rings bells.
 const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 
-/// The hub of a domain, as far as its lock tells.
+/// The hub or listener of a domain, as its lock shows.
 pub(crate) struct Presence {
     places: Vec<Domain>,
     hub: Option<Holder>,
     looked_at: Option<Instant>,
-    /// When the locks were asked last.
+    /// Time of the last query of the locks.
     asked_at: Option<Instant>,
     heard_at: Option<Instant>,
     denied: Option<Failure>,
@@ -56,7 +56,8 @@ pub struct Change {
 }
 
 impl Change {
-    /// A listener that stays behind a hub has not come with that hub's end, and has not gone when a hub stands before it.
+    /// Compares two results. A listener that runs together with a hub does not count as new when the hub ends, or as
+    /// gone when a hub starts.
     fn between(before: Option<&Holder>, now: Option<&Holder>) -> Change {
         let who = |holder: Option<&Holder>| holder.map(|holder| holder.who);
         let is_beside = before.zip(now).is_some_and(|(a, b)| a.domain == b.domain && a.who != b.who);
@@ -74,12 +75,13 @@ impl Presence {
         Presence { places, hub: None, looked_at: None, asked_at: None, heard_at: None, denied: None }
     }
 
-    /// A sign of life of the hub.
+    /// Notes that the hub has just rung a bell.
     pub(crate) fn heard(&mut self) {
         self.heard_at = Some(Instant::now());
     }
 
-    /// Looks again, if the last look is long enough ago. A hub that is heard is seldom asked for.
+    /// Checks for a hub, if the last check is long enough ago. The locks are queried less often while the hub rings
+    /// bells.
     pub(crate) fn look(&mut self) -> Change {
         let now = Instant::now();
         let is_within = |at: Option<Instant>, limit| at.is_some_and(|at| now - at < limit);
@@ -88,7 +90,7 @@ impl Presence {
         }
         self.looked_at = Some(now);
         let is_heard = is_within(self.heard_at, LOOK_EVERY) && is_within(self.asked_at, MAKE_SURE_EVERY);
-        // One that is heard and was not there has come.
+        // A hub that rings a bell but was not known has started, so the locks are queried.
         if is_heard && self.hub.is_some() {
             return Change::default();
         }
@@ -104,28 +106,28 @@ impl Presence {
         change
     }
 
-    /// When it was looked for last.
+    /// Returns the time of the last check.
     pub(crate) fn looked_at(&self) -> Option<Instant> {
         self.looked_at
     }
 
-    /// Where the hub lives, if there is one.
+    /// Returns the domain of the hub or listener, if one runs.
     pub(crate) fn domain(&self) -> Option<&Domain> {
         self.hub.as_ref().map(|holder| &holder.domain)
     }
 
-    /// Who publishes there.
+    /// Returns whether it is a hub or a listener.
     pub(crate) fn who(&self) -> Option<Who> {
         self.hub.as_ref().map(|holder| holder.who)
     }
 
-    /// The failure for callers that cannot wait for a hub.
+    /// Returns the failure for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
         self.no_hub_beside(|| RunningHub::all(Path::new("/")))
     }
 
-    /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. A directory
-    /// that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
+    /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. A
+    /// directory that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
     pub(crate) fn no_hub_here(&self) -> Failure {
         self.no_hub_beside(Vec::new)
     }
@@ -135,7 +137,7 @@ impl Presence {
         self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &hubs(), &of_process))
     }
 
-    /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
+    /// Returns the failure if a shortage of descriptors prevents the check for a hub.
     pub(crate) fn short(&self) -> Option<Failure> {
         self.denied.clone().filter(|denied| denied.kind == Kind::Short)
     }
@@ -147,7 +149,7 @@ impl Presence {
                 hub => Ok((hub, Who::Hub)),
             });
             match asked {
-                // 0: it has the lock and not yet written who it is.
+                // 0: the process holds the lock, but has not written its ID yet.
                 Ok((None | Some(0), _)) => {}
                 Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
                 // A shortage is kept, because the other places fail for it, too.
@@ -159,8 +161,8 @@ impl Presence {
     }
 }
 
-/// Returns the failure for a domain without a hub at `places`. `denied` is the failure to open one of them, `hubs` are the
-/// hubs of this machine, and `caller` is the environment of this process.
+/// Returns the failure for a domain without a hub at `places`. `denied` is the failure to open one of them, `hubs` are
+/// the hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
     let name = places.first().map(Domain::name).unwrap_or_default();
     let is_named = |hub: &RunningHub| hub.uid != caller.uid && hub.domain.as_deref() == Some(name);
@@ -214,6 +216,34 @@ pub fn find(places: &[Domain]) -> Result<Domain, Failure> {
 
 /// How long a hub that is starting may take to become visible: a verb without a hub ends within a second.
 pub const GRACE: Duration = Duration::from_millis(500);
+
+/// Returns the sensors of the hub at the first live one of `places`. Returns none in place of an error, and never
+/// waits.
+///
+/// # Examples
+///
+/// ```
+/// use scanhub_client::{live_sensors, places};
+///
+/// let places = places(Some("no-hub-is-here"))?;
+/// assert!(live_sensors(&places).is_empty());
+/// # Ok::<(), scanhub_client::Failure>(())
+/// ```
+pub fn live_sensors(places: &[Domain]) -> Vec<String> {
+    live(places, scanhub_shm::sensors)
+}
+
+/// Returns the topics of each of [`live_sensors`] as `SENSOR/TOPIC`.
+pub fn live_topics(places: &[Domain]) -> Vec<String> {
+    let mut topics = live(places, scanhub_shm::published);
+    topics.sort();
+    topics.into_iter().map(|(sensor, topic)| format!("{sensor}/{}", topic.name())).collect()
+}
+
+fn live<T>(places: &[Domain], of: impl Fn(&Domain) -> Result<Vec<T>, Failure>) -> Vec<T> {
+    let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    places.iter().find(lives).and_then(|domain| of(domain).ok()).unwrap_or_default()
+}
 
 #[cfg(test)]
 mod tests {

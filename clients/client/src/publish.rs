@@ -1,31 +1,32 @@
-//! Topics that a program publishes itself, such as what it makes of others. They are as a hub's own: consumers follow them
-//! by name, in every language, see what they missed, and are woken. A name has one publisher: its lock says that it lives.
-//! Refuses to know what is published.
-
-mod publication;
+//! Publishes topics of a program, such as results that it computes from other topics. Subscribers follow them like
+//! topics of a hub: by name, in every language, with a count of missed samples, and without polling. A name has one
+//! publisher, which holds a lock while it runs.
 
 use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
 use std::rc::{Rc, Weak};
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
+use scanhub_schema::{
+    Failure, Header, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote,
+};
 use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use scanhub_shm::{
-    DEFAULT_DOMAIN, Domain, Environment, ListenLock, NameLock, holder, name_held, publisher_domain,
+    DEFAULT_DOMAIN, Domain, DueRings, Environment, ListenLock, NameLock, Node, Payload, TopicPublisher,
+    Waker, holder, name_held, publisher_domain,
 };
-use scanhub_shm::{DueRings, Node, Payload, TopicPublisher, Waker};
 
-pub use publication::Publication;
+use crate::clock;
 
-/// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names: consumers follow it by
+/// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs follow it by
 /// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
 ///
-/// Which names are possible depends on the topic. One that no hub makes, such as people or angles of a mount, has a name of
-/// its own, as `mount`: any number of programs publish so, each under another name. A topic that a hub makes is published for
-/// somebody else, as `tracker.near` (`OWNER.NAME`), and one process of a domain does that.
+/// Which names are possible depends on the topic. A topic that no hub publishes, such as people or the angles of a
+/// mount, has a name without a dot, such as `mount`. Any number of programs publish this way, each under another name.
+/// A topic that hubs publish has a name of the form `OWNER.NAME`, such as `tracker.near`. Only one process of a domain
+/// publishes these.
 ///
-/// A process that publishes more than one topic, or for more than 32 consumers, opens a [`PublishSession`].
+/// A process that publishes more than one topic, or for more than 32 subscribers, opens a [`PublishSession`].
 ///
 /// # Errors
 ///
@@ -50,8 +51,8 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failur
     Publication::in_domain(&home(None)?, name)
 }
 
-/// Returns where a program publishes in `domain`, or if none is named in that which SCANHUB_DOMAIN names: its first live place,
-/// or that which a hub would take.
+/// Returns where a program publishes in `domain`, or if none is named in that which SCANHUB_DOMAIN names: its first
+/// live place, or that which a hub would take.
 ///
 /// # Errors
 ///
@@ -62,47 +63,48 @@ pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
     publisher_domain(name, None, &Environment::of_process())
 }
 
-/// A process's stay in a domain as one that publishes. It ends when the session and all that was made of it are dropped.
+/// Membership of a publishing process in a domain. It ends when the session and every publisher created from it are
+/// dropped.
 pub struct PublishSession(Rc<Membership>);
 
 struct Membership {
     domain: Domain,
     limits: TopicLimits,
     boot: u64,
-    /// A second waker of the same name would take the first one's consumers along at its end.
+    /// Wakers by name. A second waker of the same name would disconnect the subscribers of the first one when it ends.
     sensors: RefCell<Vec<Weak<Awakener>>>,
     node: Node,
-    // Behind the node, for whoever takes it next finds no other one.
+    // After the node, so that the next holder of the lock finds no node of this process.
     lock: Place,
 }
 
-/// What says that the process publishes.
+/// Lock of the publishing process.
 enum Place {
-    /// For others, under names with a dot.
+    /// For other machines, under names with a dot.
     Others { _lock: ListenLock },
     /// Under a name of its own.
     Own { name: String, _lock: NameLock },
 }
 
-/// Whether there is memory for `topics` of one sensor.
+/// Checks that there is memory for `topics` of one sensor.
 fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Failure> {
     check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))
 }
 
-/// Descriptors of a service, and of its first consumer.
+/// Descriptors of a service, and of its first subscriber.
 const SERVICE_DESCRIPTORS: u64 = 8;
 
 impl PublishSession {
-    /// Takes the domain's one place for a process that publishes beside its hub, and cleans up what dead ones left. There
-    /// has to be memory for one sensor with `topics`. All topics of the session will be made as `limits` say; one that
-    /// consumers kept alive has the places that it was made with.
+    /// Takes the domain's only lock for a process that publishes in addition to the hub, and removes the shared memory
+    /// of killed processes. There must be memory for one sensor with `topics`. `limits` hold for all topics of the
+    /// session, but a topic that subscribers have kept alive has the places for subscribers that it was created with.
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another process (or another session of this one) has it: the message has its
-    /// number; [`Kind::Configuration`](scanhub_schema::Kind) if the limits are none of those that can be;
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the directory is
-    /// another user's.
+    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another process, or another session of this one, holds the lock.
+    /// The message has its process ID. [`Kind::Configuration`](scanhub_schema::Kind) if the limits are invalid;
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind)
+    /// if the directory is another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
@@ -110,16 +112,16 @@ impl PublishSession {
         Ok(PublishSession::with(domain, limits, scanhub_shm::hub_node(domain)?, lock))
     }
 
-    /// Publishes as `name`, beside a hub or a listener if there is one, of which it takes no place: for what is made of the
-    /// topics of a domain, such as tracks of people, and for what no hub knows. The name has no dot, and no sensor of the hub
-    /// has it. Else as [`open`](Self::open).
+    /// Publishes as `name`. A hub or a listener may run in the same domain. Use it for results that a program computes
+    /// from other topics, for example tracks of people, and for data that no hub has. The name has no dot, and it is
+    /// not that of a sensor of the hub. The rest is as in [`open`](Self::open).
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes as `name`: a program, or the hub whose sensor
-    /// it is. The message names the process. Returns [`Kind::Configuration`](scanhub_schema::Kind) if the name is invalid, or if
-    /// subscribers still wait for a sensor of this name after its hub has ended. Otherwise the errors of
-    /// [`open`](Self::open) and [`sensor`](Self::sensor).
+    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes as `name`: a program, or the hub
+    /// whose sensor it is. The message names the process. Returns [`Kind::Configuration`](scanhub_schema::Kind) if the
+    /// name is invalid, or if subscribers still wait for a sensor of this name after its hub has ended. Otherwise the
+    /// errors of [`open`](Self::open) and [`sensor`](Self::sensor).
     pub fn beside(
         domain: &Domain,
         name: &str,
@@ -149,7 +151,7 @@ impl PublishSession {
         PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, lock }))
     }
 
-    /// Returns what the topics of the session are made for.
+    /// Returns the limits of the session's topics.
     pub fn limits(&self) -> &TopicLimits {
         &self.0.limits
     }
@@ -164,13 +166,15 @@ impl PublishSession {
         check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)
     }
 
-    /// Makes what wakes the consumers of the topics of `name`, which is `OWNER.NAME`: a hub's sensors have no dot, so that
-    /// nobody publishes in the place of another. A name that is there already is the same one.
+    /// Creates the publisher of the topics of `name`, which is `OWNER.NAME`. Sensors of a hub have no dot in their
+    /// names, so no program publishes in the place of a hub. A second call with the same name returns the same
+    /// publisher.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible; [`Kind::Short`](scanhub_schema::Kind) if memory or
-    /// descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the place is taken by another user.
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible; [`Kind::Short`](scanhub_schema::Kind)
+    /// if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the place is taken by another
+    /// user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
         check_followed(name)?;
         let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
@@ -191,36 +195,37 @@ impl PublishSession {
         Ok(SensorPublisher(sensor))
     }
 
-    /// Removes what consumers that were killed left in the domain. Call it every few seconds.
+    /// Removes the shared memory of killed processes. Call it every few seconds.
     pub fn clean_up(&self) {
         self.0.node.try_cleanup_dead_nodes();
     }
 }
 
-/// The topics of one name, and what wakes their consumers.
+/// The topics of one name. They share the waker of their subscribers.
 pub struct SensorPublisher(Rc<Awakener>);
 
 struct Awakener {
     name: String,
     waker: Waker,
-    /// What was sent and not rung for.
+    /// Rings of the samples that were sent since the last [`SensorPublisher::wake`].
     due: Cell<DueRings>,
     membership: Rc<Membership>,
 }
 
 impl SensorPublisher {
-    /// Makes the topic that carries `P`, with all memory that it may need.
+    /// Creates the topic that carries `P`, with all memory that it may need.
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if this process publishes it already; [`Kind::Configuration`](scanhub_schema::Kind) if only
-    /// sensors have the topic, and the name has no dot; [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short;
-    /// [`Kind::Failed`](scanhub_schema::Kind) if the topic exists with another layout.
+    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if this process publishes it already;
+    /// [`Kind::Configuration`](scanhub_schema::Kind) if only sensors have the topic, and the name has no dot;
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind)
+    /// if the topic exists with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
         self.topic_for(self.limits())
     }
 
-    /// Makes the topic as [`topic`](Self::topic), for samples as long as `limits` say.
+    /// Creates the topic as [`topic`](Self::topic), for samples up to the length in `limits`.
     ///
     /// # Errors
     ///
@@ -239,18 +244,18 @@ impl SensorPublisher {
         check_topics(&[P::TOPIC], limits)?;
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
-        // To write into what has no memory behind it would end the process.
+        // A write to memory that the kernel cannot provide would kill the process.
         scanhub_shm::allocate(domain)?;
         Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
 
-    /// Returns what the topics of the session are made for.
+    /// Returns the limits of the session's topics.
     pub fn limits(&self) -> &TopicLimits {
         &self.0.membership.limits
     }
 
-    /// Wakes the consumers that got samples of any topic of this name since the last call, for `why`. Once is enough for
-    /// samples that are sent together.
+    /// Wakes the subscribers that have received samples of any topic of this name since the last call, for `why`. One
+    /// call is enough for samples that are sent together.
     ///
     /// # Errors
     ///
@@ -261,10 +266,178 @@ impl SensorPublisher {
         self.0.waker.tell(why)
     }
 
-    /// `reached` consumers got a sample of `topic`.
+    /// Notes that `reached` subscribers have received a sample of `topic`.
     fn note(&self, topic: Topic, reached: usize) {
         let mut due = self.0.due.get();
         due.note(topic, reached);
         self.0.due.set(due);
+    }
+}
+
+/// Publisher of one topic. It fills in headers and sequence numbers, and wakes the subscribers.
+pub struct Publication<P: Payload + ?Sized> {
+    // Dropped before the waker and the session.
+    topic: TopicPublisher<P>,
+    sensor: SensorPublisher,
+}
+
+impl<P: Payload + ?Sized> Publication<P> {
+    /// Publishes as [`publish`](crate::publish) does, in `domain`.
+    ///
+    /// # Errors
+    ///
+    /// As [`publish`](crate::publish).
+    pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Failure> {
+        let (topics, limits) = ([P::TOPIC], TopicLimits::default());
+        if P::TOPIC.maker() == Maker::Link {
+            return PublishSession::open(domain, &topics, limits)?.sensor(name)?.topic();
+        }
+        PublishSession::beside(domain, name, &topics, limits)?.topic()
+    }
+
+    fn new(topic: TopicPublisher<P>, sensor: SensorPublisher) -> Publication<P> {
+        Publication { topic, sensor }
+    }
+
+    /// Returns the header of a sample that is made now: both stamps are this moment, on CLOCK_MONOTONIC, and its number
+    /// is the next one.
+    pub fn header(&self) -> Header {
+        let now_ns = clock::now_ns();
+        let number = self.topic.next_number();
+        Header {
+            seq: number,
+            topic_seq: number,
+            stamp_first_ns: now_ns,
+            stamp_last_ns: now_ns,
+            wall_ns: clock::wall_ns(),
+            boot: self.sensor.0.membership.boot,
+            hub_pid: std::process::id(),
+            ..Header::default()
+        }
+    }
+
+    /// Returns the header of a sample that was measured at `stamp_ns` on CLOCK_MONOTONIC. The other fields are those of
+    /// [`header`](Self::header).
+    pub fn header_at(&self, stamp_ns: u64) -> Header {
+        let now = self.header();
+        let wall_ns = now.wall_ns.wrapping_sub(now.stamp_last_ns.wrapping_sub(stamp_ns));
+        Header { stamp_first_ns: stamp_ns, stamp_last_ns: stamp_ns, wall_ns, ..now }
+    }
+
+    /// Skips `count` numbers without a sample: subscribers count `count` missed samples.
+    pub fn skip(&mut self, count: u64) {
+        self.topic.skip(count);
+    }
+
+    /// Returns the number that the next sample will have: from 0, as they are sent.
+    pub fn next_number(&self) -> u64 {
+        self.topic.next_number()
+    }
+
+    /// Returns the number of subscribers of the topic.
+    pub fn subscribers(&self) -> usize {
+        self.topic.subscribers()
+    }
+
+    /// Connects new subscribers, and sends them the samples that the topic stores for late joiners. If samples of the
+    /// topic are rare, call it ten times a second.
+    pub fn connect(&self) {
+        // The next sample tries again to connect a subscriber that cannot be connected now.
+        let _ = self.topic.connect();
+    }
+
+    /// Returns the number of samples that were not sent for lack of memory.
+    pub fn failed(&self) -> u64 {
+        self.topic.failed()
+    }
+
+    /// Sends a sample of `len` bytes that `fill` writes in place, beginning with all of them 0, and wakes the
+    /// subscribers. Use it for payloads of variable size, such as a scan.
+    ///
+    /// # Errors
+    ///
+    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) if it is longer than the topic was
+    /// made for.
+    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+        let header = self.header();
+        self.send_len_with(&header, len, fill)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes no
+    /// subscriber. Returns the number of subscribers that have received it.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than the topic was made for:
+    /// its number is used up.
+    pub fn send_len_with(
+        &mut self,
+        header: &Header,
+        len: usize,
+        fill: impl FnOnce(&mut P),
+    ) -> Result<usize, Failure> {
+        self.topic.send_len(header, len, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
+    }
+}
+
+impl<P: Payload> Publication<P> {
+    /// Sends a sample that `fill` writes in place, beginning with the payload's default, and wakes the subscribers.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up. Else as
+    /// [`SensorPublisher::wake`].
+    pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+        let header = self.header();
+        self.send_with(&header, fill)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends as [`send`](Self::send) a sample that was measured at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of
+    /// a mount.
+    ///
+    /// # Errors
+    ///
+    /// As [`send`](Self::send).
+    pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+        let header = self.header_at(stamp_ns);
+        self.send_with(&header, fill)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends as [`send`](Self::send), with `header` but for the sample's number in the topic, and wakes no subscriber.
+    /// Use it for samples of several topics that are sent together. Returns the number of subscribers that have
+    /// received it.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up.
+    pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
+        self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
+    }
+}
+
+impl Publication<[u8]> {
+    /// Sends `bytes` as a sample and wakes the subscribers.
+    ///
+    /// # Errors
+    ///
+    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) for more than
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
+    pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Failure> {
+        let header = self.header();
+        self.send_bytes_with(&header, bytes)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with).
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than
+    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
+    pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
+        self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }
 }

@@ -1,17 +1,17 @@
 //! The robot's verdict: its sensors' zones combined; a sensor without recent data counts as unknown.
 
-mod source;
-
 use std::os::fd::BorrowedFd;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Verdict, Zones, check_followed};
+use scanhub_schema::{Failure, Verdict, Zones, check_followed, is_remote};
 use scanhub_shm::Domain;
 
+use crate::clock;
+use crate::presence::{GRACE, Who};
 use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
-pub use source::{RobotHeard, RobotSource};
+use crate::zones::{Freshness, Heard, ZonesSource};
 
 /// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
 /// domain without a hub, the sensors of other machines that are published there. The hub may start later.
@@ -56,8 +56,8 @@ impl Robot {
         self.sensors().find(|(_, of_sensor)| *of_sensor == verdict).map(|(sensor, _)| sensor)
     }
 
-    /// Returns the distance from the robot's centre, in mm, of what is nearest to it, and the sensor that sees it there. Sensors
-    /// that are unknown may see nothing at all.
+    /// Returns the distance of the nearest point from the robot's center in mm, and the sensor that measures it. A
+    /// sensor whose verdict is unknown may report no point at all.
     pub fn nearest(&self) -> Option<(u32, &str)> {
         self.parts.iter().filter_map(|(sensor, zones)| Some((zones.nearest()?.1, sensor.as_str()))).min()
     }
@@ -72,8 +72,8 @@ impl Robot {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
 
-    /// Counts `sensor` as unknown until its data arrives; returns its position. [`robot`](robot()) does that by itself: it is
-    /// for programs that get samples another way.
+    /// Counts `sensor` as unknown until its data arrives; returns its position. [`robot`](robot()) does that by itself:
+    /// it is for programs that get samples another way.
     pub fn expect(&mut self, sensor: &str) -> usize {
         self.parts.push((sensor.to_owned(), Zones::unknown()));
         self.parts.len() - 1
@@ -111,14 +111,15 @@ impl RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Takes early warnings too ([`Early`](scanhub_schema::Early)): the verdict becomes worse before a scan is complete, and is taken
-    /// back if that does not come to be. To be said before the first wait.
+    /// Takes early warnings too ([`Early`](scanhub_schema::Early)): the verdict becomes worse before a scan is
+    /// complete, and the hub withdraws the warning if the scan does not confirm it. Call it before the first wait.
     pub fn with_early(self) -> RobotFollower {
         RobotFollower { source: self.source.with_early(), ..self }
     }
 
-    /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
-    /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next).
+    /// Waits until zones of any sensor arrive, or become too old, and returns what is known then. The first call waits
+    /// until this is so for each sensor. A sensor becomes unknown as with
+    /// [`ZonesFollower::next`](crate::ZonesFollower::next).
     ///
     /// # Errors
     ///
@@ -175,17 +176,252 @@ impl RobotFollower {
         self.session.descriptor()
     }
 
-    /// Returns whether somebody publishes in the domain, a hub or a listener, as of the last call of [`next`](Self::next),
-    /// [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
+    /// Returns whether a hub or a listener publishes in the domain, as of the last call of
+    /// [`next`](Self::next), [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
     pub fn hub_lives(&self) -> bool {
         self.session.domain().is_some()
     }
 
-    /// Takes all waiting samples; returns whether there were any.
+    /// Takes all samples that have arrived. Returns whether there were any.
     fn hear(&mut self) -> Result<bool, Failure> {
-        // As with one sensor's zones what is there comes first; but who always finds something has to see a hub come, too.
+        // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
+        // notice a new hub.
         let heard = self.source.drain(&mut self.session)?;
         self.session.look()?;
         Ok(self.source.drain(&mut self.session)? || heard)
+    }
+}
+
+/// The zones of a robot's sensors, combined sample by sample, in the caller's session. If no sensor is named, it
+/// follows those of the hub, or those of other machines if only they are published. It never waits.
+pub struct RobotSource {
+    robot: Robot,
+    parts: Vec<ZonesSource>,
+    /// Index of the sensor that is next in the round, so that no sensor waits for the samples of another one.
+    turn: usize,
+    /// Whether each sensor has sent a sample or missed its deadline once, so that the result includes all of them.
+    begun: bool,
+    /// Deadline while there are no sensors.
+    nobody: Freshness,
+    /// Origin of the sensors.
+    whose: Whose,
+    /// Time of the next look for new sensors, while a hub or a listener publishes.
+    call_at: Option<Instant>,
+    /// Whether early warnings count too.
+    early: bool,
+}
+
+/// Origin of the sensors of a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Whose {
+    /// The caller named them.
+    Named,
+    /// All sensors of this publisher: the first one, and the hub as soon as one runs, because the zones of another
+    /// robot's sensors are around the center of that robot. After the hub has exited, its sensors are missing; no
+    /// others replace them.
+    All(Option<Who>),
+}
+
+/// A sample or silence of one sensor, and what is known with it.
+pub struct RobotHeard {
+    /// The zones of all sensors.
+    pub robot: Robot,
+    /// The sample or silence.
+    pub heard: Heard,
+}
+
+/// Maximum number of sensors of other machines that are followed: as many as a listener publishes at a time. None is
+/// ever removed, and a sender in its network can announce new ones without end.
+const MOST_REMOTE: usize = 16;
+
+/// Name of an entry for the sensors of other machines that are not followed. It is always unknown. No sensor can have
+/// this name.
+const OTHERS: &str = "others...";
+
+/// Interval at which the source looks for new sensors. A hub that is starting creates its topics one after the other.
+const CALL_EVERY: Duration = Duration::from_secs(1);
+
+impl RobotSource {
+    /// Creates a source for the zones of `sensors`. If empty: all sensors, as [`robot`](robot()) does.
+    pub fn new(sensors: &[&str]) -> RobotSource {
+        let mut source = RobotSource {
+            robot: Robot::default(),
+            parts: Vec::new(),
+            turn: 0,
+            begun: false,
+            nobody: Freshness::new(clock::now()),
+            whose: if sensors.is_empty() { Whose::All(None) } else { Whose::Named },
+            call_at: None,
+            early: false,
+        };
+        sensors.iter().for_each(|sensor| source.follow(sensor));
+        source
+    }
+
+    /// Takes early warnings too: a warning makes the verdict worse until the zones of its scan arrive, or until the hub
+    /// withdraws it.
+    pub fn with_early(self) -> RobotSource {
+        let RobotSource { robot, parts, .. } = self;
+        let names = robot.sensors().map(|(sensor, _)| sensor);
+        let parts = parts.into_iter().zip(names).map(|(part, sensor)| part.with_early(sensor)).collect();
+        RobotSource { parts, robot, early: true, ..self }
+    }
+
+    /// Returns what is known.
+    pub fn robot(&self) -> &Robot {
+        &self.robot
+    }
+
+    /// Returns whether the topic of each sensor has been there at least once.
+    pub fn subscribed(&self) -> bool {
+        !self.parts.is_empty() && self.parts.iter().all(ZonesSource::subscribed)
+    }
+
+    /// Returns the next sample or silence of any sensor, after each has had one.
+    ///
+    /// # Errors
+    ///
+    /// As [`ZonesSource::receive`].
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
+        let heard = self.hear(session)?;
+        Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
+    }
+
+    /// Returns the time after which [`receive`](Self::receive) returns a silence if no sample arrives.
+    pub fn left(&self) -> Option<Duration> {
+        match &self.parts[..] {
+            [] => self.nobody.left(clock::now()),
+            parts => parts.iter().filter_map(ZonesSource::left).min(),
+        }
+    }
+
+    /// Takes all samples and silences. Returns whether there were any.
+    ///
+    /// # Errors
+    ///
+    /// As [`ZonesSource::receive`].
+    pub fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
+        let mut any = false;
+        while self.hear(session)?.is_some() {
+            any = true;
+        }
+        Ok(any)
+    }
+
+    fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+        if self.gives_way_to(session.publishes()) {
+            return Ok(Some(Heard::nothing()));
+        }
+        for _ in 0..self.parts.len() {
+            let turn = self.turn;
+            self.turn = (turn + 1) % self.parts.len();
+            if let Some(heard) = self.parts[turn].receive(session)? {
+                self.robot.hear(turn, heard.zones);
+                self.begun = self.begun || self.parts.iter().all(ZonesSource::has_spoken);
+                if self.begun {
+                    return Ok(Some(heard));
+                }
+            }
+        }
+        // Last, because it takes longer than everything else.
+        self.discover(session)?;
+        let silence = self.parts.is_empty() && self.nobody.silence(clock::now());
+        Ok(silence.then(Heard::nothing))
+    }
+
+    /// Forgets the sensors of other machines if a hub has started. Nothing is known until the hub's own sensors send
+    /// zones. Returns whether this has just happened.
+    fn gives_way_to(&mut self, who: Option<Who>) -> bool {
+        if (self.whose, who) != (Whose::All(Some(Who::Listener)), Some(Who::Hub)) {
+            return false;
+        }
+        (self.robot, self.parts, self.turn, self.begun) = (Robot::default(), Vec::new(), 0, false);
+        (self.whose, self.call_at) = (Whose::All(Some(Who::Hub)), None);
+        true
+    }
+
+    /// Adds the sensors that exist and are not followed yet. Sensors that no longer exist stay, so that the user sees
+    /// that they are missing.
+    fn discover(&mut self, session: &Session) -> Result<(), Failure> {
+        let (Whose::All(whose), Some(domain)) = (self.whose, session.domain()) else {
+            self.call_at = None;
+            return Ok(());
+        };
+        let now = Instant::now();
+        if now < *self.call_at.get_or_insert(now + GRACE / 2) {
+            return Ok(());
+        }
+        self.call_at = Some(now + CALL_EVERY);
+        let whose = whose.or(session.publishes());
+        let is_followed = |sensor: &String| is_remote(sensor) == (whose == Some(Who::Listener));
+        for sensor in scanhub_shm::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
+            self.whose = Whose::All(whose);
+            self.meet(&sensor);
+        }
+        Ok(())
+    }
+
+    /// Follows `sensor`, if it is not followed yet. If there are too many sensors of other machines, [`OTHERS`]
+    /// represents the rest; it never has data.
+    fn meet(&mut self, sensor: &str) {
+        let is_known = |name: &str| self.robot.sensors().any(|(known, _)| known == name);
+        if is_known(sensor) {
+            return;
+        }
+        if !is_remote(sensor) || self.parts.len() < MOST_REMOTE {
+            self.follow(sensor);
+        } else if !is_known(OTHERS) {
+            self.robot.expect(OTHERS);
+        }
+    }
+
+    fn follow(&mut self, sensor: &str) {
+        self.robot.expect(sensor);
+        let part = ZonesSource::new(sensor);
+        self.parts.push(if self.early { part.with_early(sensor) } else { part });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn remote_sensors_without_number_are_one_unknown_part() {
+        let mut source = RobotSource::new(&[]);
+        source.whose = Whose::All(Some(Who::Listener));
+        for n in 0..1000 {
+            source.meet(&format!("robot{n}.front"));
+            source.meet("robot0.front");
+        }
+        assert_eq!((source.parts.len(), source.robot.parts.len()), (MOST_REMOTE, MOST_REMOTE + 1));
+        for (name, zones) in source.robot.parts.iter_mut().filter(|(name, _)| name != OTHERS) {
+            assert!(is_remote(name));
+            zones.verdict = Verdict::Clear as u8;
+        }
+        assert_eq!((source.robot.verdict(), source.robot.worst()), (Verdict::Unknown, Some(OTHERS)));
+        assert!(scanhub_schema::check_followed(OTHERS).is_err(), "no sensor has its name");
+        // A hub's own sensors are as many as its configuration says.
+        let mut source = RobotSource::new(&[]);
+        (0..40).for_each(|n| source.meet(&format!("front{n}")));
+        assert_eq!(source.parts.len(), 40);
+    }
+
+    #[test]
+    fn remote_sensors_give_way_to_the_hub_and_never_the_hub_to_them() {
+        let mut source = RobotSource::new(&[]);
+        assert!(!source.gives_way_to(Some(Who::Hub)), "nobody is followed yet");
+        source.whose = Whose::All(Some(Who::Listener));
+        source.follow("robot1.front");
+        source.begun = true;
+        assert!(!source.gives_way_to(None) && !source.gives_way_to(Some(Who::Listener)));
+        assert!(source.gives_way_to(Some(Who::Hub)));
+        assert!(source.robot().sensors().next().is_none() && !source.begun, "nothing is known");
+        for who in [Some(Who::Hub), None, Some(Who::Listener), Some(Who::Hub)] {
+            assert!(!source.gives_way_to(who));
+            assert_eq!(source.whose, Whose::All(Some(Who::Hub)));
+        }
+        let mut named = RobotSource::new(&["robot1.front"]);
+        assert!(!named.gives_way_to(Some(Who::Hub)), "whoever names a sensor means it");
     }
 }

@@ -1,32 +1,35 @@
-//! A process in a domain, across restarts of its hub: membership, what wakes the process, and the news that a hub started
-//! or ended. Refuses to know what is followed.
+//! Membership of a process in a domain, across restarts of its hub. It wakes the process when samples arrive, and
+//! reports that a hub has started or ended.
 
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
+use rustix::event::epoll;
+use rustix::io::Errno;
+use rustix::time::{
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
+};
 use scanhub_schema::{Failure, Kind, Topic};
-use scanhub_shm::{Domain, holder, is_starting};
-use scanhub_shm::{Node, Payload, Subscriber};
+use scanhub_shm::{Domain, Node, Payload, Subscriber, holder, is_starting};
 
 use crate::presence::{Change, Presence, Who};
-use crate::readiness::Readiness;
 use crate::wait::{Wait, Wakeups};
 
-/// The longest wait: so often the hub is looked for, and the caller's reasons to stop are seen.
+/// Maximum wait. After it, the session looks for the hub, and the caller can stop.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
 
-/// How often whoever waits at the descriptor looks for a hub that lives: an event tells of the next one.
+/// Interval at which a program that polls the descriptor checks a running hub. An event reports the next hub.
 const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
 
 /// Membership in the first of several domains where a hub runs.
 pub struct Session {
     presence: Presence,
     joined: Option<Joined>,
-    /// A hub came, and it was not yet seen whether its shared memory has the names that were joined.
+    /// Whether a hub has started, and its shared memory may have other names than those that were joined.
     is_unsure: bool,
     number: u32,
     wait: Wait,
-    /// For who waits at a descriptor of his own.
+    /// For programs that poll the descriptor.
     readiness: Option<Readiness>,
     subscribed_at: Option<Instant>,
 }
@@ -38,7 +41,7 @@ struct Joined {
 }
 
 impl Session {
-    /// Makes a session that will join the first live one of `places`, as soon as one is.
+    /// Creates a session that joins the first live one of `places`, as soon as there is one.
     pub fn new(places: Vec<Domain>) -> Session {
         Session {
             presence: Presence::new(places),
@@ -51,16 +54,17 @@ impl Session {
         }
     }
 
-    /// Has the session woken by `wait`; to be said before anything is followed.
+    /// Sets the method by which the session waits. Call it before anything is followed.
     pub fn by(self, wait: Wait) -> Session {
         Session { wait, ..self }
     }
 
-    /// Looks whether a hub runs, and joins its domain if it is at a new place.
+    /// Checks whether a hub runs, and joins its domain if it is at a new place.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are; who has joined already goes on without a look.
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. A session that has joined already
+    /// continues without this check.
     pub fn look(&mut self) -> Result<Change, Failure> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -80,7 +84,7 @@ impl Session {
         if is_here && !self.is_unsure {
             return Ok(change);
         }
-        // After all had gone, the next hub's shared memory has other names.
+        // If all processes have left the domain, the shared memory of the next hub has other names.
         let is_member = |joined: &Joined| scanhub_shm::is_member(&joined.node, domain.root());
         match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
             Some(true) => {}
@@ -90,7 +94,7 @@ impl Session {
                     self.joined = Some(Joined { domain, wakeups, node });
                     self.number += 1;
                 }
-                // It is just starting or ending: the next look tells.
+                // It is just starting or ending: the next look decides.
                 Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
                 Err(failure) => return Err(failure),
             },
@@ -99,7 +103,7 @@ impl Session {
         Ok(change)
     }
 
-    /// Returns where the hub lives, if there is one.
+    /// Returns the domain of the hub or listener, if one runs.
     pub fn domain(&self) -> Option<&Domain> {
         self.presence.domain()
     }
@@ -109,7 +113,7 @@ impl Session {
         self.presence.who()
     }
 
-    /// Returns whether there is a hub, and not only a listener that stands for those of other machines.
+    /// Returns whether a hub runs, and not only a listener that publishes the sensors of other machines.
     pub fn hub_lives(&self) -> bool {
         self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
     }
@@ -119,7 +123,7 @@ impl Session {
         self.domain().is_some_and(|domain| is_starting(domain.root()) == Ok(true))
     }
 
-    /// Returns what to tell who cannot wait for a hub.
+    /// Returns the failure for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Failure {
         self.presence.no_hub()
     }
@@ -134,13 +138,13 @@ impl Session {
         self.number
     }
 
-    /// Returns a subscriber of `sensor`, or nothing as long as its hub or topic is not there. What wakes it comes first, so
-    /// that nothing is sent unheard between the two.
+    /// Returns a subscriber of `sensor`, or `None` if its hub or topic does not exist yet. The bell or event is opened
+    /// first, so that the subscriber is woken for every sample.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if memory, descriptors or places for consumers are short; [`Kind::Failed`] if the topic has another
-    /// layout.
+    /// [`Kind::Short`] if memory, descriptors or places for subscribers are short; [`Kind::Failed`] if the topic has
+    /// another layout.
     pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
@@ -156,19 +160,20 @@ impl Session {
         Ok(subscriber)
     }
 
-    /// Returns a moment in the life of a `sensor`'s `topic`: as long as it is the same, nothing new was sent. Nothing where
-    /// that is not known. What late joiners get comes without a word, so a moment ends with the next look for the hub, too.
+    /// Returns a value that stays the same until a sample of the `sensor`'s `topic` may have been sent. `None` if that
+    /// is unknown. The hub sends samples to late joiners without ringing the bell, so each check for the hub changes
+    /// the value.
     pub fn moment(&self, sensor: &str, topic: Topic) -> Option<(u32, Instant)> {
         let rung = self.joined.as_ref()?.wakeups.rung(sensor, topic)?;
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// Returns what is readable while there may be something to receive or to see to, the same over all lives of the hub;
-    /// from the first call on it takes [`settle`](Self::settle) to make it unreadable.
+    /// Returns a descriptor that is readable while there may be something to receive or to check. It stays the same
+    /// when the hub is replaced. From the first call on, only [`settle`](Self::settle) makes it unreadable.
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] if it is not waited by event, [`Kind::Short`] if descriptors are short.
+    /// [`Kind::Configuration`] if the session does not wait by event, [`Kind::Short`] if descriptors are short.
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
         if self.wait != Wait::Event {
             let hint = "make it wait by event: a bell has no descriptor";
@@ -187,15 +192,16 @@ impl Session {
         Ok(readiness.as_fd())
     }
 
-    /// Takes note that nothing waits, and that nothing will have to be looked for before `left`: the descriptor, if it is used,
-    /// is not readable before. Returns whether something was sent meanwhile: then look again first.
+    /// Notes that the caller has received all samples, and waits until `left` has passed. The descriptor, if
+    /// it is used, is not readable until then. Returns whether samples were sent in the meantime; then the caller must
+    /// receive them first.
     ///
     /// # Errors
     ///
     /// [`Kind::Short`] if the system cannot wait.
     pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
         let Some(readiness) = &self.readiness else { return Ok(false) };
-        // What a late joiner is handed comes without an event.
+        // The hub sends samples to late joiners without an event.
         let is_settled = self.subscribed_at.is_some_and(|at| at.elapsed() >= MAKE_SURE_EVERY);
         let pace =
             if is_settled && self.presence.domain().is_some() { MAKE_SURE_EVERY } else { LONGEST_WAIT };
@@ -203,8 +209,8 @@ impl Session {
         self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())
     }
 
-    /// Sleeps until something was sent, at the latest until `until`, and 100 ms at most; returns at once if something
-    /// may have been sent since the caller looked. Hold no sample meanwhile.
+    /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if one may have been sent
+    /// since the caller looked. Hold no sample during the call.
     ///
     /// # Errors
     ///
@@ -213,14 +219,15 @@ impl Session {
         self.wait_for(until.map(|until| until.saturating_duration_since(Instant::now())))
     }
 
-    /// Sleeps as [`wait`](Self::wait) does, for a time instead of until one.
+    /// Sleeps as [`wait`](Self::wait) does, at most for `left`.
     ///
     /// # Errors
     ///
     /// As [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
         let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
-        // This takes events that whoever polls has not seen: for him it is readable until it is settled.
+        // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
+        // settled.
         if let Some(readiness) = &self.readiness {
             readiness.again_in(Duration::ZERO)?;
         }
@@ -231,5 +238,94 @@ impl Session {
                 Ok(())
             }
         }
+    }
+}
+
+/// Descriptor for programs that also wait for other things: an epoll over a timer and the events of each hub. It is
+/// readable while there may be something to receive or to check.
+struct Readiness {
+    descriptor: OwnedFd,
+    clock: OwnedFd,
+}
+
+impl Readiness {
+    /// Creates a descriptor that is readable at once. Fails with [`Kind::Short`] without free descriptors.
+    fn new() -> Result<Readiness, Failure> {
+        let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
+        let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
+        let descriptor = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?;
+        let readiness = Readiness { descriptor, clock };
+        readiness.add(readiness.clock.as_fd())?;
+        readiness.again_in(Duration::ZERO)?;
+        Ok(readiness)
+    }
+
+    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with [`Kind::Short`] without free
+    /// memory.
+    fn add(&self, event: BorrowedFd<'_>) -> Result<(), Failure> {
+        let data = epoll::EventData::new_u64(0);
+        match epoll::add(&self.descriptor, event, data, epoll::EventFlags::IN) {
+            Ok(()) | Err(Errno::EXIST) => Ok(()),
+            Err(error) => Err(short(error)),
+        }
+    }
+
+    /// Sets the timer: it makes the descriptor readable after `left`.
+    fn again_in(&self, left: Duration) -> Result<(), Failure> {
+        // 0 would mean never.
+        let left = left.max(Duration::from_nanos(1));
+        let it_value = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
+        let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value };
+        timerfd_settime(&self.clock, TimerfdTimerFlags::empty(), &once).map(|_| ()).map_err(short)
+    }
+}
+
+impl AsFd for Readiness {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.descriptor.as_fd()
+    }
+}
+
+fn short(error: Errno) -> Failure {
+    let what = format!("no descriptor to wait on: {error}");
+    Failure::new(Kind::Short, what, "`ulimit -n` may be too small")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustix::event::{PollFd, PollFlags, poll};
+    use std::io::{Write, pipe};
+
+    fn is_readable(readiness: &Readiness, within: Duration) -> bool {
+        let mut fds = [PollFd::new(readiness, PollFlags::IN)];
+        let within = Timespec { tv_sec: within.as_secs() as i64, tv_nsec: within.subsec_nanos().into() };
+        poll(&mut fds, Some(&within)).unwrap() == 1
+    }
+
+    const LONG: Duration = Duration::from_secs(20);
+
+    #[test]
+    fn the_time_makes_it_readable_once() {
+        let readiness = Readiness::new().unwrap();
+        assert!(is_readable(&readiness, LONG), "nobody has looked yet");
+        readiness.again_in(LONG).unwrap();
+        assert!(!is_readable(&readiness, Duration::ZERO));
+        readiness.again_in(Duration::from_millis(1)).unwrap();
+        assert!(is_readable(&readiness, LONG));
+    }
+
+    #[test]
+    fn events_come_and_go() {
+        let readiness = Readiness::new().unwrap();
+        readiness.again_in(LONG).unwrap();
+        let (read, mut write) = pipe().unwrap();
+        for _ in 0..2 {
+            readiness.add(read.as_fd()).unwrap();
+        }
+        write.write_all(b"!").unwrap();
+        assert!(is_readable(&readiness, LONG));
+        drop(read);
+        assert!(!is_readable(&readiness, Duration::ZERO));
     }
 }

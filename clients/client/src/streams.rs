@@ -22,12 +22,10 @@
 //! }
 //! ```
 
-pub use crate::follower::Follower;
-pub use crate::freshness::Freshness;
+pub use crate::follower::{Follower, Noted, Numbers};
 pub use crate::join::Join;
-pub use crate::numbers::{Noted, Numbers};
 pub use crate::presence::{Change, GRACE, Who, find};
 pub use crate::robot::{RobotHeard, RobotSource};
 pub use crate::sample::{Sample, Source};
 pub use crate::session::Session;
-pub use crate::zones::{ZonesSource, ZonesState};
+pub use crate::zones::{Freshness, ZonesSource, ZonesState};

@@ -1,4 +1,4 @@
-//! How a consumer waits for the samples of its sensors. Refuses to know which topics they are, and whether there is a hub.
+//! Waits until samples of any followed sensor arrive: on doorbells in shared memory, on events, or by spinning.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -8,11 +8,11 @@ use scanhub_shm::{Bell, Listener, Node, Unsupported};
 
 use crate::clock;
 
-/// What a consumer sleeps on, or that it does not sleep.
+/// Method by which a subscriber waits for samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Wait {
-    /// Sleep on a word in shared memory; one call of the hub wakes all. If the system cannot wait for the words of several
-    /// sensors at once, it uses the event.
+    /// Sleep on a word in shared memory; one call of the hub wakes all. If the system cannot wait for the words of
+    /// several sensors at once, it uses the event.
     #[default]
     Doorbell,
     /// Sleep on the event, which other languages use; the hub sends one message to each consumer.
@@ -21,34 +21,31 @@ pub enum Wait {
     Spin,
 }
 
-/// What wakes a consumer, for each of its sensors.
+/// Doorbells or events of the sensors that a subscriber follows.
 pub(crate) struct Wakeups {
     wait: Wait,
     sensors: Vec<Sensor>,
-    /// A bell was rung since that was last asked.
+    /// Whether a bell was rung since the last [`Wakeups::take_rang`].
     rang: bool,
-    /// Wake-ups by event were taken since the last sleep, and samples looked for since.
+    /// Whether wake-ups by event were taken since the last sleep, so that the caller has looked for samples.
     taken: bool,
 }
 
 struct Sensor {
     name: String,
     bell: Option<Bell>,
-    /// For each ring that tells of a topic that is followed how often the bell had been rung so when samples were last looked
-    /// for.
+    /// For each ring of a followed topic, the count of the bell when the caller last looked for samples.
     rung: [Option<u32>; Ring::ALL.len()],
     listener: Option<Listener>,
 }
 
 impl Wakeups {
-    /// None yet.
     pub(crate) fn by(wait: Wait) -> Wakeups {
         Wakeups { wait, sensors: Vec::new(), rang: false, taken: false }
     }
 
-    /// Those of `topic` of the sensor `name` too; whether they are there already.
-    ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory, descriptors or places for consumers are.
+    /// Adds `topic` of the sensor `name`. Returns whether its bell or event exists already. Fails with
+    /// [`Kind::Short`](scanhub_schema::Kind) if memory, descriptors or places for subscribers are short.
     pub(crate) fn add(&mut self, node: &Node, name: &str, topic: Topic) -> Result<bool, Failure> {
         let ring = topic.row().ring;
         if let Some(known) = self.sensors.iter_mut().find(|sensor| sensor.name == name) {
@@ -68,21 +65,20 @@ impl Wakeups {
         Ok(is_there)
     }
 
-    /// The hub went or came: what its consumers sleep at may be another bell now, or soon.
+    /// Forgets the bells, because a hub has started or ended: the next hub has other bells.
     pub(crate) fn renew(&mut self) {
         self.sensors.iter_mut().for_each(|sensor| sensor.bell = None);
     }
 
-    /// Sleeps until one of them wakes, a signal comes or `left` is over; returns at once if one has since the caller looked
-    /// for samples.
-    ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
+    /// Sleeps until a bell or event wakes it, a signal arrives or the time `left` has passed. Returns at once if this
+    /// has happened since the caller looked for samples. Fails with [`Kind::Short`](scanhub_schema::Kind) if the system
+    /// cannot wait.
     pub(crate) fn wait(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         if self.wait == Wait::Event {
             return self.wait_for_event(node, left);
         }
         for sensor in &mut self.sensors {
-            // Who has come this far goes on without a bell, a little later each time, until there is one.
+            // Without a bell, the subscriber continues with a short sleep each time, until there is one.
             let _ = sensor.go_to_bell(node);
         }
         if self.heard() {
@@ -110,20 +106,20 @@ impl Wakeups {
         }
     }
 
-    /// Whether a bell was rung since this was last asked: who rings, lives.
+    /// Returns whether a bell was rung since the last call. If so, the hub is alive.
     pub(crate) fn take_rang(&mut self) -> bool {
         std::mem::take(&mut self.rang)
     }
 
-    /// How often the bell of the sensor `name` was rung for `topic` by now; nothing where that does not tell whether something
-    /// was sent.
+    /// Returns how often the bell of the sensor `name` was rung for `topic`. `None` if this does not show whether a
+    /// sample was sent.
     pub(crate) fn rung(&self, name: &str, topic: Topic) -> Option<u32> {
         let sensor = self.sensors.iter().find(|sensor| sensor.name == name)?;
         let bell = sensor.bell.as_ref().filter(|bell| !bell.is_closed())?;
         Some(bell.rung(topic.row().ring))
     }
 
-    /// Whether a bell was rung since samples were last looked for; what was sent before can be received now.
+    /// Returns whether a bell was rung since the last call. Samples that were sent before can be received now.
     fn heard(&mut self) -> bool {
         let mut any = false;
         for Sensor { bell, rung, .. } in &mut self.sensors {
@@ -141,7 +137,7 @@ impl Wakeups {
     fn wait_for_event(&mut self, node: &Node, left: Duration) -> Result<(), Failure> {
         let mut is_new = false;
         for sensor in self.sensors.iter_mut().filter(|sensor| sensor.listener.is_none()) {
-            // Its hub was still making it, or there was no room.
+            // Its hub was still creating it, or there was no room.
             is_new |= sensor.listen(node).unwrap_or(false);
         }
         if is_new {
@@ -157,13 +153,12 @@ impl Wakeups {
         scanhub_shm::sleep(&listeners, left)
     }
 
-    /// What is readable while events are pending, of each sensor that is listened to.
+    /// Returns the descriptors that are readable while events are pending, one of each sensor with an event.
     pub(crate) fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(scanhub_shm::descriptor)
     }
 
-    /// Takes the events that are pending; whether there were any. What was sent before has to be looked for.
-    ///
+    /// Takes the pending events. Returns whether there were any; then the caller must look for samples. Fails with
     /// [`Kind::Short`](scanhub_schema::Kind) if an event does not work.
     pub(crate) fn take(&mut self) -> Result<bool, Failure> {
         let mut any = false;
@@ -173,7 +168,7 @@ impl Wakeups {
         Ok(any)
     }
 
-    /// From now on. Returns without a wait: what came before the listeners has to be looked for.
+    /// Uses events from now on. Returns without a wait, because samples may have arrived before the listeners existed.
     fn turn_to_events(&mut self, node: &Node) -> Result<(), Failure> {
         self.wait = Wait::Event;
         for sensor in &mut self.sensors {
@@ -185,18 +180,18 @@ impl Wakeups {
 }
 
 impl Sensor {
-    /// Whether it listens to the event, if possible.
+    /// Opens the event. Returns whether it exists.
     fn listen(&mut self, node: &Node) -> Result<bool, Failure> {
         let Some(service) = scanhub_shm::open_wake(node, &self.name)? else { return Ok(false) };
         self.listener = Some(scanhub_shm::listener(&service)?);
         Ok(true)
     }
 
-    /// Whether it has a bell that may be rung. That of a hub that ended is given up.
+    /// Opens the bell, unless it is open. Closes the bell of a hub that has ended. Returns whether there is one.
     fn go_to_bell(&mut self, node: &Node) -> Result<bool, Failure> {
         if self.bell.as_ref().is_none_or(Bell::is_closed) {
             self.bell = Bell::open(node, &self.name)?.filter(|bell| !bell.is_closed());
-            // Another bell, another count: samples may have been sent at it before.
+            // A new bell has a count of its own, and samples may have been sent before.
             for ring in Ring::ALL {
                 self.rung[ring as usize] = self.rung[ring as usize].map(|_| self.not_yet(ring));
             }
@@ -204,14 +199,14 @@ impl Sensor {
         Ok(self.bell.is_some())
     }
 
-    /// It follows a topic of which `ring` tells. Samples may have been sent before.
+    /// Waits for `ring` too. Samples may have been sent before.
     fn hear(&mut self, ring: Ring) {
         if self.rung[ring as usize].is_none() {
             self.rung[ring as usize] = Some(self.not_yet(ring));
         }
     }
 
-    /// A number that the bell does not have now.
+    /// Returns a count that the bell does not have now.
     fn not_yet(&self, ring: Ring) -> u32 {
         self.bell.as_ref().map_or(0, |bell| bell.rung(ring).wrapping_sub(1))
     }
@@ -233,11 +228,203 @@ fn spin(bells: &[(&Bell, Ring, u32)], until_ns: u64) {
     }
 }
 
-/// Looks at the words between two at the clock.
+/// Number of polls between two readings of the clock.
 const LOOKS: u32 = 100;
 
-/// The longest sleep while a hub is gone and its successor has hung no bell.
+/// Maximum sleep while there is no bell, between the end of a hub and the start of the next one.
 const WITHOUT_BELL: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+    use scanhub_schema::Wake;
+    use scanhub_shm::Domain;
+    use scanhub_shm::Waker;
+    use std::path::PathBuf;
+    use std::sync::mpsc;
+    use std::thread;
+    use std::time::Instant;
+
+    /// A domain that goes with the test.
+    struct Place(PathBuf, Domain);
+
+    impl Place {
+        fn new(name: &str) -> Place {
+            let name = format!("w{}-{name}", std::process::id());
+            let base = PathBuf::from(format!("/tmp/sh{name}"));
+            Place(base.clone(), Domain::at(&name, &base).unwrap())
+        }
+    }
+
+    impl Drop for Place {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.0);
+            for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+                if entry.file_name().to_string_lossy().starts_with(&self.1.prefix()) {
+                    let _ = std::fs::remove_file(entry.path());
+                }
+            }
+        }
+    }
+
+    /// Far longer than any wait here may last.
+    const LONG: Duration = Duration::from_secs(60);
+
+    /// Returns whether a wait ended before its timeout, so that a bell or event has woken it.
+    fn woken(started: Instant) -> bool {
+        started.elapsed() < LONG
+    }
+
+    /// Starts the publishing side of a hub in a separate thread, because its ports cannot move. It wakes the
+    /// subscribers once for each message.
+    fn hub(domain: &Domain, sensor: &'static str) -> mpsc::Sender<()> {
+        let (tell, told) = mpsc::channel();
+        let (say, said) = mpsc::channel();
+        let node = scanhub_shm::hub_node(domain).unwrap();
+        thread::spawn(move || {
+            let waker = Waker::new(&node, sensor).unwrap();
+            say.send(()).unwrap();
+            while let Ok(()) = told.recv() {
+                waker.wake(Wake::Telegram).unwrap();
+            }
+        });
+        said.recv().unwrap();
+        tell
+    }
+
+    const FOLLOWED: [&[Topic]; 3] = [&[Topic::Zones], &[Topic::Marks], &[Topic::Status, Topic::Scan]];
+
+    #[test]
+    fn each_topic_is_told_by_its_ring() {
+        let place = Place::new("rings");
+        let hub = scanhub_shm::hub_node(&place.1).unwrap();
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let waker = Waker::new(&hub, "front").unwrap();
+        for (topics, told) in
+            FOLLOWED.into_iter().zip([&[Ring::First][..], &[Ring::Last], &[Ring::First, Ring::Last]])
+        {
+            let mut wakeups = Wakeups::by(Wait::Doorbell);
+            topics.iter().for_each(|&topic| assert!(wakeups.add(&node, "front", topic).unwrap()));
+            assert!(wakeups.heard(), "samples may have been sent before");
+            for ring in Ring::ALL {
+                let before = topics.iter().map(|&topic| wakeups.rung("front", topic)).collect::<Vec<_>>();
+                waker.ring(ring);
+                let after = topics.iter().map(|&topic| wakeups.rung("front", topic)).collect::<Vec<_>>();
+                let is_told = told.contains(&ring);
+                assert_eq!((wakeups.heard(), before != after), (is_told, is_told), "{topics:?} {ring:?}");
+                assert!(!wakeups.heard());
+            }
+        }
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        for topic in [Topic::Zones, Topic::Marks] {
+            assert!(wakeups.add(&node, "front", topic).unwrap());
+            assert!(wakeups.heard() && !wakeups.heard(), "another topic has samples that wait");
+        }
+    }
+
+    #[test]
+    fn each_way_wakes_for_every_sensor() {
+        for (wait, name) in [(Wait::Doorbell, "bell"), (Wait::Event, "event"), (Wait::Spin, "spin")] {
+            FOLLOWED.into_iter().for_each(|topics| wakes_for_every_sensor(wait, name, topics));
+        }
+    }
+
+    fn wakes_for_every_sensor(wait: Wait, name: &str, topics: &[Topic]) {
+        let place = Place::new(name);
+        let mut wakeups = Wakeups::by(wait);
+        let hubs = ["front", "rear"].map(|sensor| hub(&place.1, sensor));
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        assert!(!wakeups.add(&node, "left", Topic::Zones).unwrap(), "there is no such sensor");
+        for (at, sensor) in ["front", "rear"].into_iter().enumerate() {
+            topics.iter().for_each(|&topic| assert!(wakeups.add(&node, sensor, topic).unwrap()));
+            for hub in &hubs[..=at] {
+                // Wake-ups from before the listener existed may occur once more.
+                wakeups.wait(&node, Duration::ZERO).unwrap();
+                wakeups.wait(&node, Duration::ZERO).unwrap();
+                let started = Instant::now();
+                hub.send(()).unwrap();
+                wakeups.wait(&node, LONG).unwrap();
+                assert!(woken(started), "{wait:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_bell_of_a_hub_that_ended_is_exchanged() {
+        let place = Place::new("ended");
+        let hub = scanhub_shm::hub_node(&place.1).unwrap();
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        let first = Waker::new(&hub, "front").unwrap();
+        assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let started = Instant::now();
+        drop(first);
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(wakeups.sensors[0].bell.is_none(), "nobody rings it any more");
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let second = Waker::new(&hub, "front").unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        second.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started));
+        assert!(wakeups.sensors[0].bell.as_ref().is_some_and(|bell| !bell.is_closed()));
+    }
+
+    #[test]
+    fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
+        let place = Place::new("removed");
+        let hub = scanhub_shm::hub_node(&place.1).unwrap();
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        // A hub that is killed closes nothing.
+        std::mem::forget(Waker::new(&hub, "front").unwrap());
+        assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
+        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if name.starts_with(&place.1.prefix()) && name.ends_with(".bell") {
+                std::fs::remove_file(entry.path()).unwrap();
+            }
+        }
+        let next = Waker::new(&hub, "front").unwrap();
+        wakeups.renew();
+        wakeups.wait(&node, Duration::ZERO).unwrap();
+        let before = wakeups.rung("front", Topic::Zones).expect("it has a bell");
+        next.wake(Wake::Telegram).unwrap();
+        assert_eq!(wakeups.rung("front", Topic::Zones), Some(before + 1));
+    }
+
+    #[test]
+    fn an_event_that_is_made_later_is_listened_to() {
+        let place = Place::new("later");
+        let hub = scanhub_shm::hub_node(&place.1).unwrap();
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        let first = Waker::new(&hub, "front").unwrap();
+        assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
+        drop(first);
+        wakeups.turn_to_events(&node).unwrap();
+        assert!(wakeups.sensors[0].listener.is_none());
+        let waker = Waker::new(&hub, "front").unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        let started = Instant::now();
+        waker.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started) && wakeups.sensors[0].listener.is_some());
+    }
+
+    #[test]
+    fn where_words_cannot_be_waited_for_the_event_wakes() {
+        let place = Place::new("turn");
+        let hub = scanhub_shm::hub_node(&place.1).unwrap();
+        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let waker = Waker::new(&hub, "front").unwrap();
+        let mut wakeups = Wakeups::by(Wait::Doorbell);
+        assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
+        wakeups.turn_to_events(&node).unwrap();
+        let started = Instant::now();
+        waker.wake(Wake::Telegram).unwrap();
+        wakeups.wait(&node, LONG).unwrap();
+        assert!(woken(started) && wakeups.wait == Wait::Event);
+    }
+}

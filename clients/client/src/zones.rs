@@ -1,22 +1,18 @@
-//! The zones of one sensor, by value, never older than they appear: a verdict that is too old becomes `unknown` here,
-//! whether the sensor, the hub or the machine stopped. A program that acts on it needs no timeout of its own.
-
-mod state;
-mod warned;
+//! Follows the zones of one sensor: its verdict, the deadline after which the verdict is `unknown`, and early warnings.
+//! The verdict expires here, whether the sensor, the hub or the machine has stopped. A program that acts on it needs no
+//! timeout.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use scanhub_schema::{Early, Failure, Header, Zones, check_followed};
+use scanhub_schema::{Early, Failure, Flags, Header, Verdict, Zones, check_followed};
 use scanhub_shm::Domain;
 
-use crate::clock;
+use crate::clock::{self, Moment};
 use crate::follower::Follower;
 use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
-pub use state::ZonesState;
-use warned::Warned;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -29,7 +25,7 @@ use warned::Warned;
 ///     let mut front = zones("front")?;
 ///     loop {
 ///         let heard = front.next()?;
-///         // Nothing known is taken for a stop.
+///         // An unknown verdict counts as a stop.
 ///         let may_go = matches!(heard.zones.verdict(), Verdict::Clear | Verdict::Slow);
 ///         println!("may go: {may_go}");
 ///     }
@@ -59,7 +55,7 @@ pub struct Heard {
 }
 
 impl Heard {
-    /// A silence.
+    /// Returns what is known during a silence.
     pub(crate) fn nothing() -> Heard {
         Heard { zones: Zones::unknown(), header: None, missed: 0, stale: true, said: Zones::unknown() }
     }
@@ -146,7 +142,7 @@ impl ZonesFollower {
     }
 
     fn look(&mut self) -> Result<Option<Heard>, Failure> {
-        // What is there comes before the question whether the hub still is: that takes longer than receiving.
+        // Samples that have arrived come first, because looking for the hub takes longer than receiving.
         if self.source.subscribed()
             && let Some(heard) = self.source.newest(&mut self.session)?
         {
@@ -161,18 +157,18 @@ impl ZonesFollower {
 pub struct ZonesSource {
     follower: Follower<Zones>,
     state: ZonesState,
-    /// Early warnings, if they are wanted.
+    /// Early warnings, if the caller wants them.
     early: Option<Box<(Follower<Early>, Warned)>>,
 }
 
 impl ZonesSource {
-    /// Makes what will follow the zones of `sensor`.
+    /// Creates a source for the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
         ZonesSource { follower: Follower::new(sensor), state: ZonesState::new(clock::now()), early: None }
     }
 
-    /// Takes early warnings of `sensor` too: one makes the verdict worse until the zones of its scan are there, or until it is
-    /// withdrawn.
+    /// Takes early warnings of `sensor` too: a warning makes the verdict worse until the zones of its scan arrive, or
+    /// until the hub withdraws it.
     pub(crate) fn with_early(self, sensor: &str) -> ZonesSource {
         ZonesSource { early: Some(Box::new((Follower::new(sensor), Warned::new()))), ..self }
     }
@@ -182,12 +178,13 @@ impl ZonesSource {
         self.follower.subscribed()
     }
 
-    /// Returns whether there was a sample, or the silence of one that does not come.
+    /// Returns whether the first sample has arrived, or its deadline has passed.
     pub fn has_spoken(&self) -> bool {
         self.state.has_spoken()
     }
 
-    /// Returns the next sample that waits; if there is none and the last one became too old just now, that.
+    /// Returns the next sample that has arrived. Returns a silence if there is none and the last sample has just become
+    /// too old.
     ///
     /// # Errors
     ///
@@ -213,7 +210,7 @@ impl ZonesSource {
         Ok(None)
     }
 
-    /// The last of all waiting samples. The skipped ones count as missed.
+    /// Returns the last of all samples that have arrived. The skipped ones count as missed.
     fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let mut newest: Option<Heard> = None;
         while let Some(mut heard) = self.receive(session)? {
@@ -223,8 +220,368 @@ impl ZonesSource {
         Ok(newest)
     }
 
-    /// Returns after which time [`receive`](Self::receive) has something to say even if no sample comes.
+    /// Returns the time after which [`receive`](Self::receive) returns a silence if no sample arrives.
     pub fn left(&self) -> Option<Duration> {
         self.state.left(clock::now())
+    }
+}
+
+/// State of one sensor's zones, for programs that receive samples from elsewhere than a session. Time is an argument.
+///
+/// # Examples
+///
+/// ```
+/// use scanhub_client::clock::Moment;
+/// use scanhub_client::streams::ZonesState;
+/// use scanhub_client::{Header, Robot, Verdict, Zones};
+///
+/// let at = |ms: u64| Moment { monotonic_ns: ms * 1_000_000, boottime_ns: ms * 1_000_000 };
+/// let (mut front, mut robot) = (ZonesState::new(at(0)), Robot::default());
+/// let position = robot.expect("front");
+/// let clear = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
+/// let header = Header { stamp_last_ns: 10_000_000, period_us: 26_640, ..Header::default() };
+/// robot.hear(position, front.take(&header, &clear, 0, at(10)).zones);
+/// assert_eq!(robot.verdict(), Verdict::Clear);
+/// // Two periods and 40 ms later.
+/// if let Some(silence) = front.silence(at(104)) {
+///     robot.hear(position, silence.zones);
+/// }
+/// assert_eq!(robot.verdict(), Verdict::Unknown);
+/// ```
+#[derive(Clone, Debug)]
+pub struct ZonesState {
+    freshness: Freshness,
+    spoken: bool,
+}
+
+impl ZonesState {
+    /// Creates the state of a sensor that the program follows from `now` on.
+    pub fn new(now: Moment) -> ZonesState {
+        ZonesState { freshness: Freshness::new(now), spoken: false }
+    }
+
+    /// Takes a sample that arrived at `now`, and returns what is known with it. `missed` samples before it were not
+    /// received.
+    pub fn take(&mut self, header: &Header, zones: &Zones, missed: u64, now: Moment) -> Heard {
+        self.spoken = true;
+        let fresh = self.freshness.heard(header, zones.verdict(), now);
+        let known = if fresh { *zones } else { Zones::unknown() };
+        Heard { zones: known, header: Some(*header), missed, stale: !fresh, said: *zones }
+    }
+
+    /// Returns a silence if the last sample has become too old: once, until the next sample arrives.
+    pub fn silence(&mut self, now: Moment) -> Option<Heard> {
+        let silence = self.freshness.silence(now).then(Heard::nothing);
+        self.spoken |= silence.is_some();
+        silence
+    }
+
+    /// Returns whether the first sample has arrived, or its deadline has passed.
+    pub fn has_spoken(&self) -> bool {
+        self.spoken
+    }
+
+    /// Returns the time until the deadline. `None` if it has passed, so that only a sample can change anything.
+    pub fn left(&self, now: Moment) -> Option<Duration> {
+        self.freshness.left(now)
+    }
+}
+
+/// Deadline of one sensor's verdict. Time is an argument.
+#[derive(Clone, Debug)]
+pub struct Freshness {
+    until: Moment,
+    /// Whether the verdict is unknown already: this silence was reported.
+    said: bool,
+}
+
+/// The hub publishes `unknown` two periods and this long after the last scan (`docs/topics.md`).
+const HUB_LIMIT_NS: u64 = 20_000_000;
+
+/// Additional time that a client waits. A live hub then reports the silence first, so that there is one `unknown` per
+/// silence.
+const AFTER_HUB_NS: u64 = 20_000_000;
+
+/// Limit of a sample without a period. It is enough for two periods of half degrees at 38400 baud, 0.4 s. It is also
+/// the minimum limit of a sample from another machine, because networks delay data, wireless ones by a tenth of a
+/// second.
+const NO_PERIOD_NS: u64 = 500_000_000;
+
+/// Time limit of the first sample. A running hub sends its last sample to new subscribers ten times a second; a hub
+/// that is starting needs longer.
+const FIRST_WORD_NS: u64 = 1_000_000_000;
+
+impl Freshness {
+    /// Creates the deadline of a sensor that the program follows from `now` on.
+    pub fn new(now: Moment) -> Freshness {
+        Freshness { until: later(now, FIRST_WORD_NS), said: false }
+    }
+
+    /// Takes a sample with `header` and `verdict` that arrived at `now`. Returns whether its verdict is valid. The
+    /// deadline runs from the stamp or from the arrival, whichever is earlier, so a stamp in the future does not extend
+    /// it. `unknown` is valid at any age.
+    pub fn heard(&mut self, header: &Header, verdict: Verdict, now: Moment) -> bool {
+        let limit_ns = match header.period_us {
+            0 => NO_PERIOD_NS,
+            period_us => 2000 * u64::from(period_us) + HUB_LIMIT_NS + AFTER_HUB_NS,
+        };
+        let is_remote = header.flags & Flags::REMOTE != 0;
+        let limit_ns = if is_remote { limit_ns.max(NO_PERIOD_NS) } else { limit_ns };
+        let silent_at = later(now, limit_ns);
+        let aged_at_ns = header.stamp_last_ns.saturating_add(limit_ns);
+        self.until = Moment { monotonic_ns: silent_at.monotonic_ns.min(aged_at_ns), ..silent_at };
+        let is_unknown = verdict == Verdict::Unknown;
+        let fresh = now.monotonic_ns < self.until.monotonic_ns;
+        self.said = is_unknown || !fresh;
+        is_unknown || fresh
+    }
+
+    /// Returns whether the verdict has become too old: `true` once, until the next sample.
+    pub fn silence(&mut self, now: Moment) -> bool {
+        let over = now.monotonic_ns >= self.until.monotonic_ns || now.boottime_ns >= self.until.boottime_ns;
+        if self.said || !over {
+            return false;
+        }
+        self.said = true;
+        true
+    }
+
+    /// Returns the time until the deadline. `None` if it has passed, so that only a sample can change anything.
+    pub fn left(&self, now: Moment) -> Option<Duration> {
+        let left_ns = self.until.monotonic_ns.saturating_sub(now.monotonic_ns);
+        let awake_ns = self.until.boottime_ns.saturating_sub(now.boottime_ns);
+        (!self.said).then(|| Duration::from_nanos(left_ns.min(awake_ns)))
+    }
+}
+
+fn later(moment: Moment, by_ns: u64) -> Moment {
+    Moment {
+        monotonic_ns: moment.monotonic_ns.saturating_add(by_ns),
+        boottime_ns: moment.boottime_ns.saturating_add(by_ns),
+    }
+}
+
+/// Zones of one sensor, combined with the early warning of the scan after them. A warning makes the verdict worse until
+/// the zones of the same scan arrive, or until the hub withdraws it. It never makes the verdict better.
+#[derive(Clone, Debug)]
+struct Warned {
+    known: Zones,
+    /// `boot` and `seq` of the last scan whose zones are known.
+    scan: Option<(u64, u64)>,
+    /// The warning that is valid, with `boot` and `seq` of its scan.
+    warning: Option<((u64, u64), Early)>,
+}
+
+impl Warned {
+    fn new() -> Warned {
+        Warned { known: Zones::unknown(), scan: None, warning: None }
+    }
+
+    /// Takes the zones of a scan, or a silence, which has no header. Returns them, made worse by the warning of a later
+    /// scan.
+    fn hear(&mut self, zones: &Zones, header: Option<&Header>) -> Zones {
+        self.known = *zones;
+        let Some(header) = header else {
+            self.warning = None;
+            return *zones;
+        };
+        self.scan = Some((header.boot, header.seq));
+        self.warning = self.warning.filter(|((boot, seq), _)| *boot == header.boot && *seq > header.seq);
+        self.warning.map_or(*zones, |(_, early)| self.with(&early))
+    }
+
+    /// Returns the zones with the warning `early`, or `None` if the zones of its scan are known.
+    fn warn(&mut self, early: &Early, header: &Header) -> Option<Zones> {
+        if self.scan.is_some_and(|(boot, seq)| boot == header.boot && header.seq <= seq) {
+            return None;
+        }
+        if early.is_withdrawn() {
+            self.warning = None;
+            return Some(self.known);
+        }
+        self.warning = Some(((header.boot, header.seq), *early));
+        Some(self.with(early))
+    }
+
+    fn with(&self, early: &Early) -> Zones {
+        let mut zones = Zones { verdict: self.known.verdict().worse(warning(early)) as u8, ..self.known };
+        if self.known.nearest().is_none_or(|(_, known_mm)| early.distance_mm < known_mm) {
+            (zones.nearest_beam, zones.nearest_mm) = (early.beam, early.distance_mm);
+        }
+        zones
+    }
+}
+
+/// Returns the verdict of a warning. A warning that this program does not know is ignored.
+fn warning(early: &Early) -> Verdict {
+    match early.verdict() {
+        warning @ (Verdict::Slow | Verdict::Stop) => warning,
+        Verdict::Clear | Verdict::Unknown => Verdict::Clear,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    /// `ms` after the machine's start; it was never suspended.
+    fn at(ms: u64) -> Moment {
+        Moment { monotonic_ns: ms * MS, boottime_ns: ms * MS }
+    }
+
+    fn header(stamp_ms: u64, period_us: u32) -> Header {
+        Header { stamp_last_ns: stamp_ms * MS, period_us, ..Header::default() }
+    }
+
+    /// Two periods of half degrees, 20 ms, and as long again for the hub: 93.28 ms.
+    const PERIOD_US: u32 = 26_640;
+
+    #[test]
+    fn one_word_per_silence() {
+        let mut freshness = Freshness::new(at(0));
+        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(100));
+        assert_eq!(freshness.left(at(100)), Some(Duration::from_micros(93_280)));
+        assert!(!freshness.silence(at(193)));
+        assert!(freshness.silence(at(194)) && !freshness.silence(at(195)) && !freshness.silence(at(90_000)));
+        assert_eq!(freshness.left(at(195)), None);
+        freshness.heard(&header(200, PERIOD_US), Verdict::Stop, at(200));
+        assert!(!freshness.silence(at(293)) && freshness.silence(at(294)));
+    }
+
+    #[test]
+    fn who_was_never_heard_is_unknown_and_one_that_is_unknown_stays_so() {
+        let mut freshness = Freshness::new(at(50));
+        assert_eq!(freshness.left(at(50)), Some(Duration::from_secs(1)));
+        assert!(!freshness.silence(at(1049)) && freshness.silence(at(1050)) && !freshness.silence(at(9000)));
+        // The hub's own word of the silence.
+        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(2000)));
+        assert_eq!((freshness.silence(at(9000)), freshness.left(at(2000))), (false, None));
+        assert!(freshness.heard(&header(2000, PERIOD_US), Verdict::Unknown, at(60_000)), "to a late joiner");
+    }
+
+    #[test]
+    fn what_waited_is_no_news() {
+        let mut freshness = Freshness::new(at(0));
+        assert!(freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(180)));
+        assert!(!freshness.silence(at(193)) && freshness.silence(at(194)));
+        assert!(!freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(500)), "too old when it came");
+        assert!(!freshness.silence(at(9000)), "which says enough");
+        assert!(freshness.heard(&header(99_999, PERIOD_US), Verdict::Clear, at(600)));
+        assert!(!freshness.silence(at(693)) && freshness.silence(at(694)), "a stamp in the future");
+    }
+
+    #[test]
+    fn time_passes_while_the_machine_is_suspended() {
+        let mut freshness = Freshness::new(at(0));
+        freshness.heard(&header(100, PERIOD_US), Verdict::Clear, at(100));
+        let resumed = Moment { boottime_ns: 3_600_000 * MS, ..at(110) };
+        assert_eq!(freshness.left(resumed), Some(Duration::ZERO));
+        assert!(freshness.silence(resumed));
+    }
+
+    #[test]
+    fn a_network_has_half_a_second_at_least() {
+        let mut freshness = Freshness::new(at(0));
+        for (period_us, limit_ms) in [(0, 500), (PERIOD_US, 500), (230_000, 500), (1_000_000, 2040)] {
+            let remote = Header { flags: Flags::REMOTE, ..header(100, period_us) };
+            freshness.heard(&remote, Verdict::Clear, at(100));
+            assert_eq!(freshness.left(at(100)), Some(Duration::from_millis(limit_ms)), "{period_us}");
+        }
+    }
+
+    #[test]
+    fn headers_that_say_nonsense() {
+        let mut freshness = Freshness::new(at(0));
+        freshness.heard(&header(100, 0), Verdict::Clear, at(100));
+        assert!(!freshness.silence(at(599)) && freshness.silence(at(600)));
+        let end = Header { stamp_last_ns: u64::MAX, period_us: u32::MAX, ..Header::default() };
+        let last = Moment { monotonic_ns: u64::MAX, boottime_ns: u64::MAX };
+        assert!(!freshness.heard(&end, Verdict::Clear, last));
+    }
+
+    fn zones(verdict: u8) -> Zones {
+        Zones { verdict, ..Zones::unknown() }
+    }
+
+    const STOP: Early =
+        Early { verdict: 2, flags: 0, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
+
+    /// Vectors that the tests of the Python package use, too.
+    const VECTORS: &str = include_str!("../../../tests/vectors/early.txt");
+
+    fn of_scan(scan: &str) -> Header {
+        let (boot, seq) = scan.split_once(':').expect("LIFE:NUMBER");
+        Header {
+            boot: boot.parse().expect("a life"),
+            seq: seq.parse().expect("a number"),
+            ..Header::default()
+        }
+    }
+
+    fn said(zones: &Zones) -> String {
+        let nearest = zones.nearest().map_or("-".to_owned(), |(_, mm)| mm.to_string());
+        format!("{} {nearest}", zones.verdict() as u8)
+    }
+
+    #[test]
+    fn what_is_known_is_what_the_vectors_say() {
+        let (mut warned, mut steps) = (Warned::new(), 0);
+        let lines = VECTORS.lines().zip(1..).filter(|(line, _)| !line.is_empty() && !line.starts_with('#'));
+        for (line, number) in lines {
+            let (step, known) = line.split_once(" => ").unwrap_or((line, ""));
+            let words: Vec<&str> = step.split(' ').collect();
+            let verdict = |word: &str| word.parse().expect("a verdict");
+            let told = match words[..] {
+                ["begin"] => {
+                    warned = Warned::new();
+                    continue;
+                }
+                ["zones", scan, word, nearest] => {
+                    let mut zones = zones(verdict(word));
+                    if let Ok(mm) = nearest.parse() {
+                        (zones.nearest_beam, zones.nearest_mm) = (7, mm);
+                    }
+                    Some(warned.hear(&zones, Some(&of_scan(scan))))
+                }
+                ["silence"] => Some(warned.hear(&Zones::unknown(), None)),
+                ["early", scan, word, mm] => {
+                    let distance_mm = mm.parse().expect("a distance");
+                    warned.warn(&Early { verdict: verdict(word), distance_mm, ..STOP }, &of_scan(scan))
+                }
+                ["withdrawn", scan] => {
+                    warned.warn(&Early { flags: Early::WITHDRAWN, ..STOP }, &of_scan(scan))
+                }
+                _ => panic!("line {number}: {line}"),
+            };
+            assert_eq!(told.as_ref().map_or("old".to_owned(), said), known, "line {number}: {line}");
+            steps += 1;
+        }
+        assert!(steps > 40, "{steps}");
+    }
+
+    #[test]
+    fn the_nearest_beam_is_that_of_the_nearest_point() {
+        let mut warned = Warned::new();
+        warned.hear(&zones(0), Some(&of_scan("1:7")));
+        let stop = warned.warn(&STOP, &of_scan("1:8")).expect("a warning");
+        assert_eq!((stop.verdict(), stop.nearest()), (Verdict::Stop, Some((40, 500))));
+        let near = Zones { nearest_beam: 3, nearest_mm: 400, ..zones(0) };
+        assert_eq!(warned.hear(&near, Some(&of_scan("1:7"))).nearest(), Some((3, 400)));
+    }
+
+    #[test]
+    fn a_warning_never_makes_it_better() {
+        let mut warned = Warned::new();
+        let slow = Early { verdict: Verdict::Slow as u8, ..STOP };
+        for verdict in Verdict::ALL {
+            warned.hear(&zones(verdict as u8), None);
+            for early in [slow, STOP, Early { verdict: 9, ..STOP }, Early { verdict: 0, ..STOP }] {
+                let now =
+                    warned.warn(&early, &of_scan("1:1")).expect("nothing is known of the scan").verdict();
+                assert_eq!(now.worse(verdict), now, "{verdict:?} and {early:?}");
+            }
+        }
     }
 }
