@@ -1,17 +1,14 @@
 //! The command line: the verbs and their arguments. Syntax only; the code that uses a value checks what it means.
 
-mod background;
 mod bridge;
 mod complete;
 mod config;
-mod control;
 mod convert;
 mod examples;
 mod gateway;
 mod generated;
 pub(crate) mod replay;
 pub(crate) mod simulate;
-mod zones;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -23,20 +20,17 @@ use scanhub_network::{KeyArgs, ListenArgs, VerbOptions};
 use scanhub_perception::verbs::{SiteArgs, TiltArgs, TrackArgs};
 use scanhub_schema::{Failure, Family};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
-use scanhub_verbs::{Bounds, duration};
+use scanhub_verbs::{BackgroundArgs, ControlArgs, EchoArgs, HzArgs, InfoArgs, ListArgs, ZonesArgs, duration};
 
 use crate::demo::{Families, World};
 
 pub(crate) use self::config::Config;
-pub(crate) use background::Background;
 pub(crate) use bridge::Bridge;
 pub(crate) use complete::Complete;
-pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
 pub(crate) use replay::Replay;
-pub(crate) use zones::Zones;
 
 /// Share laser scanners (SICK LMS 2xx, LDROBOT, RPLIDAR) between programs. One hub reads the ports; any number of programs get
 /// the scans.
@@ -93,11 +87,6 @@ impl Everywhere {
         VerbOptions { domain: &self.domain, root: self.root.as_deref(), json: self.json }
     }
 
-    /// The directories that may hold domains.
-    pub(crate) fn bases(&self) -> Vec<PathBuf> {
-        self.root.clone().map_or_else(|| Environment::of_process().bases(), |root| vec![root])
-    }
-
     /// The places in which a client looks for it.
     pub(crate) fn places(&self) -> Result<Vec<Domain>, Failure> {
         Domain::candidates(&self.domain, self.root.as_deref(), &Environment::of_process())
@@ -131,20 +120,13 @@ pub(crate) enum Verb {
         run: Run,
     },
     /// List the sensors and topics of the running hub
-    List {
-        /// List every live domain of this user instead
-        #[arg(long)]
-        domains: bool,
-    },
+    List(ListArgs),
     /// Show state, settings and counters of sensors
-    Info {
-        /// Show only this sensor
-        sensor: Option<String>,
-    },
+    Info(InfoArgs),
     /// Print samples as they arrive
-    Echo(Echo),
+    Echo(EchoArgs),
     /// Measure rate, jitter and loss of topics
-    Hz(Hz),
+    Hz(HzArgs),
     /// Measure how old samples are on arrival, split into line, hub and wake-up: percentiles
     Latency(scanhub_verbs::LatencyArgs),
     /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
@@ -156,11 +138,11 @@ pub(crate) enum Verb {
     /// Explain telegrams field by field, or write them
     Telegram(scanhub_tools::telegram::TelegramArgs),
     /// Pause a sensor, resume it, or restart its session
-    Control(Control),
+    Control(ControlArgs),
     /// Show, reset, freeze, save or load the background model of a sensor
-    Background(Background),
+    Background(BackgroundArgs),
     /// Learn which part of a sensor's view is the robot itself
-    Zones(Zones),
+    Zones(ZonesArgs),
     /// Follow people across the sensors and rooms of a site, and count them at doors
     Track(TrackArgs),
     /// 3D from a tilting scanner: points, background, obstacles
@@ -255,76 +237,13 @@ fn worlds() -> impl TypedValueParser<Value = World> {
         .map(|name| World::parse(&name).expect("one of the possible names"))
 }
 
-/// Parses the window of `hz`. A shorter one could never hold two samples that are far enough apart for a rate.
-fn window(text: &str) -> Result<Duration, String> {
-    match duration::parse(text)? {
-        window if window >= MIN_WINDOW => Ok(window),
-        _ => Err(format!("{text:?} is too short for a rate: at least {MIN_WINDOW:?}")),
-    }
-}
-
-const MIN_WINDOW: Duration = Duration::from_millis(500);
-
 fn families() -> impl TypedValueParser<Value = Families> {
     PossibleValuesParser::new(Families::names())
         .map(|name| Families::parse(&name).expect("one of the possible names"))
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Limits {
-    /// Stop after this number of samples
-    #[arg(short = 'n', value_name = "COUNT", value_parser = clap::value_parser!(u64).range(1..))]
-    count: Option<u64>,
-    /// Stop after this time, for example 10s, 250ms, 5m
-    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
-    run_for: Option<Duration>,
-    /// Exit with 3 after this time without a sample
-    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
-    timeout: Option<Duration>,
-}
-
-impl Limits {
-    pub(crate) fn bounds(&self) -> Bounds {
-        Bounds { count: self.count, run_for: self.run_for, timeout: self.timeout }
-    }
 }
 
 /// Parses the name of a family.
 fn family(text: &str) -> Result<Family, String> {
     let names = || Family::ALL.map(Family::name).join(", ");
     Family::parse(&text.to_lowercase()).ok_or_else(|| format!("one of {}, not {text:?}", names()))
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Echo {
-    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics; robot/zones for the verdict over all
-    /// sensors
-    #[arg(required = true, value_name = "SENSOR/TOPIC")]
-    pub(crate) topics: Vec<String>,
-    /// Print comma-separated values
-    #[arg(long, conflicts_with_all = ["json", "raw"])]
-    pub(crate) csv: bool,
-    /// With --csv: ranges in meters
-    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
-    pub(crate) meters: bool,
-    /// With --csv: columns intensity_0 .. after the ranges
-    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
-    pub(crate) intensities: bool,
-    /// Print raw bytes: telegrams, or the payload of another topic
-    #[arg(long, conflicts_with = "json")]
-    pub(crate) raw: bool,
-    #[command(flatten)]
-    pub(crate) limits: Limits,
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Hz {
-    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
-    #[arg(value_name = "SENSOR/TOPIC")]
-    pub(crate) topics: Vec<String>,
-    /// Time span that each line covers, at least 0.5s
-    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = window)]
-    pub(crate) window: Duration,
-    #[command(flatten)]
-    pub(crate) limits: Limits,
 }

@@ -20,10 +20,8 @@ use std::sync::atomic::AtomicBool;
 use clap::error::ErrorKind;
 use rustix::process::Signal;
 use scanhub_config::Config;
-use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Failure, Kind, Printable, json_line};
-use scanhub_shm::{Domain, RunningHub};
-use scanhub_verbs::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
+use scanhub_shm::Domain;
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -102,46 +100,12 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let domains = (everywhere.hub_domain()?, everywhere.places()?);
             args.run(&run.sources(), domains, json, &mut out, &*interrupt()?)
         }
-        Verb::List { domains: true } => {
-            let hubs = if everywhere.root.is_none() { RunningHub::all(Path::new("/")) } else { Vec::new() };
-            scanhub_verbs::list_domains(&everywhere.bases(), &hubs, everywhere.json, &mut out)
+        Verb::List(list) => {
+            list.run(json, &everywhere.domain, everywhere.root.as_deref(), &mut out, &*interrupt()?)
         }
-        Verb::List { domains: false } => {
-            let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
-            scanhub_verbs::list(&options, &mut out, &*interrupt()?)
-        }
-        Verb::Info { sensor } => {
-            let options =
-                InfoOptions { sensor: sensor.clone(), json: everywhere.json, places: everywhere.places()? };
-            scanhub_verbs::info(&options, &mut out, &*interrupt()?)
-        }
-        Verb::Echo(echo) => {
-            let format = match (everywhere.json, echo.csv, echo.raw) {
-                (true, ..) => Format::Json,
-                (_, true, _) => {
-                    Format::Csv(ScanColumns { meters: echo.meters, intensities: echo.intensities })
-                }
-                (_, _, true) => Format::Raw,
-                _ => Format::Text,
-            };
-            let options = EchoOptions {
-                topics: echo.topics.clone(),
-                format,
-                bounds: echo.limits.bounds(),
-                places: everywhere.places()?,
-            };
-            scanhub_verbs::echo(&options, &mut out, &mut io::stderr(), &*interrupt()?)
-        }
-        Verb::Hz(hz) => {
-            let options = HzOptions {
-                topics: hz.topics.clone(),
-                json: everywhere.json,
-                window: hz.window,
-                bounds: hz.limits.bounds(),
-                places: everywhere.places()?,
-            };
-            scanhub_verbs::hz(&options, &mut out, &mut io::stderr(), &*interrupt()?)
-        }
+        Verb::Info(info) => info.run(json, &everywhere.places()?, &mut out, &*interrupt()?),
+        Verb::Echo(echo) => echo.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
+        Verb::Hz(hz) => hz.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Latency(latency) => {
             latency.run(json, out.is_terminal(), &everywhere.places()?, &mut out, &mut notes, &*interrupt()?)
         }
@@ -154,17 +118,20 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Record(record) => {
             record.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt_by(&ENDS)?)
         }
-        Verb::Control(control) => {
-            scanhub_verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?)
-        }
+        Verb::Control(control) => control.run(json, &everywhere.places()?, &mut out, &*interrupt()?),
         Verb::Bridge(bridge) => bridge.run(everywhere).map(|never| match never {}),
         Verb::Key(key) => key.run(everywhere.json, &mut out),
         Verb::Background(background) => {
-            // A model is read before Ctrl-C is a flag, which would not end a person's typing.
-            let options = background.options(everywhere)?;
-            scanhub_verbs::background(&options, &mut out, &*interrupt()?)
+            background.run(json, &everywhere.places()?, &mut io::stdin(), &mut out, interrupt)
         }
-        Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
+        Verb::Zones(zones) => {
+            let mut progress = scanhub_tools::Progress::on_stderr();
+            let mut show = |state: Option<&str>| match state {
+                Some(state) => progress.show(state),
+                None => progress.clear(),
+            };
+            zones.run(json, &everywhere.places()?, &mut out, &mut notes, &mut show, &*interrupt()?)
+        }
         Verb::Track(track) => track.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Tilt(tilt) => tilt.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),
         Verb::Site(site) => site.run(json, &mut out),

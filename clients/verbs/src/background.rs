@@ -3,9 +3,11 @@
 
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, SystemTime};
 
+use clap::{Args, Subcommand};
 use scanhub_client::request;
 use scanhub_files::output::{self, Target};
 use scanhub_files::regular;
@@ -15,106 +17,117 @@ use scanhub_schema::{
 use scanhub_shm::Domain;
 use serde::Serialize;
 
-use crate::control::done;
+use crate::control::confirm;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
-use crate::{json, text};
+use crate::text;
 
-/// What `background` is asked for.
-#[derive(Clone, Debug)]
-pub struct BackgroundOptions {
-    /// The sensor.
+/// Arguments of `background`.
+#[derive(Args, Clone, Debug)]
+pub struct BackgroundArgs {
+    /// The sensor
     pub sensor: String,
-    /// What to do with its model.
+    /// Request about its model.
+    #[command(subcommand)]
     pub order: ModelOrder,
-    /// Objects instead of text.
-    pub json: bool,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
 }
 
-/// What to do with a background model.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// Request about a background model.
+#[derive(Clone, Debug, PartialEq, Eq, Subcommand)]
 pub enum ModelOrder {
-    /// Show it.
+    /// Show how many beams are known; with --json, every range
     Show,
-    /// Forget it and learn it again.
+    /// Forget the model and learn it again
     Reset,
-    /// Keep it as it is.
+    /// Freeze the model: stop learning
     Freeze,
-    /// Learn on.
+    /// Continue learning
     Thaw,
-    /// Write it to a file, whole or not at all.
+    /// Save the model to a file
     Save {
-        /// The file; `-` is stdout.
+        /// The file; - is stdout
         file: PathBuf,
-        /// What is there is replaced.
+        /// Overwrite an existing file
+        #[arg(short, long)]
         force: bool,
     },
-    /// Take this one for it, see [`saved_model`].
-    Load(Box<Background>),
+    /// Load a saved model
+    Load {
+        /// The file; - is stdin
+        file: PathBuf,
+        /// Accept a model of another sensor
+        #[arg(long)]
+        any_sensor: bool,
+    },
 }
 
-/// Does what `options` say and writes a line to `out`.
-///
-/// [`Kind::Configuration`] if the hub refuses a model; [`Kind::Output`] if a file is there or cannot be written;
-/// [`Kind::Failed`] if there is no model yet to be saved; else as [`control`](crate::control()).
-pub fn background(
-    options: &BackgroundOptions,
-    out: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let BackgroundOptions { sensor, order, json, places } = options;
-    as_word(check_sensor(sensor))?;
-    let ask = |verb| request(places, &Request::new(sensor, verb), stop);
-    let mut output = Output::new(out);
-    let taken = |output: &mut Output<'_>, verb: Verb| {
-        quiet(if *json {
-            output.json(&json::control(sensor, verb))
-        } else {
-            output.line(|line| write!(line, "{sensor}: {}", done(verb)))
-        })
-    };
-    match order {
-        ModelOrder::Reset => {
-            ask(Verb::Reset)?;
-            let is_frozen = !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();
-            taken(&mut output, Verb::Reset)?;
-            if is_frozen {
-                let hint =
-                    format!("it is frozen: nothing is learned until `scanhub background {sensor} thaw`");
-                quiet(output.line(|line| write!(line, "{hint}")))?;
+impl BackgroundArgs {
+    /// Sends the request to the hub in one of `places` and writes a line to `out`. Reads the model to load before it calls
+    /// `interrupt`, whose flag would not end the read of a terminal.
+    ///
+    /// # Errors
+    ///
+    /// - The errors of [`saved_model`] and of `interrupt`.
+    /// - [`Kind::Configuration`] if the hub refuses a model.
+    /// - [`Kind::Output`] if a file exists or cannot be written.
+    /// - [`Kind::Failed`] if there is no model yet to be saved.
+    /// - The errors of [`ControlArgs::run`](crate::ControlArgs::run).
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        input: &mut dyn Read,
+        out: &mut dyn Write,
+        interrupt: impl FnOnce() -> Result<Arc<AtomicBool>, Failure>,
+    ) -> Result<(), Failure> {
+        let sensor = &self.sensor;
+        let loaded = match &self.order {
+            ModelOrder::Load { file, any_sensor } => Some(saved_model(file, sensor, *any_sensor, input)?),
+            _ => None,
+        };
+        let stop = interrupt()?;
+        as_word(check_sensor(sensor))?;
+        let ask = |verb| request(places, &Request::new(sensor, verb), &stop);
+        let mut output = Output::new(out);
+        let verb = match &self.order {
+            ModelOrder::Show => {
+                let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
+                return quiet(if json {
+                    output.json(&Kept { model: as_json(sensor, &model), kept_wall_ns })
+                } else {
+                    output.line(|line| {
+                        write!(line, "{sensor}: ")?;
+                        text::background(line, &model)?;
+                        match kept_wall_ns.map(Duration::from_nanos) {
+                            Some(kept) => write!(line, ", kept {} ago", Age(wall().saturating_sub(kept))),
+                            None => Ok(()),
+                        }
+                    })
+                });
             }
-            Ok(())
-        }
-        ModelOrder::Freeze => ask(Verb::Freeze).and_then(|_| taken(&mut output, Verb::Freeze)),
-        ModelOrder::Thaw => ask(Verb::Thaw).and_then(|_| taken(&mut output, Verb::Thaw)),
-        ModelOrder::Load(model) => {
-            request(places, &Request::load(sensor, model), stop)?;
-            taken(&mut output, Verb::Load)
-        }
-        ModelOrder::Show => {
-            let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
-            quiet(if *json {
-                output.json(&Kept { model: as_json(sensor, &model), kept_wall_ns })
-            } else {
-                output.line(|line| {
-                    write!(line, "{sensor}: ")?;
-                    text::background(line, &model)?;
-                    match kept_wall_ns.map(Duration::from_nanos) {
-                        Some(kept) => write!(line, ", kept {} ago", Age(wall().saturating_sub(kept))),
-                        None => Ok(()),
-                    }
-                })
-            })
-        }
-        ModelOrder::Save { file, force } => {
-            if file != Path::new(STANDARD) {
-                Target::open(file)?.check(*force)?;
+            ModelOrder::Save { file, force } => {
+                if file != Path::new(STANDARD) {
+                    Target::open(file)?.check(*force)?;
+                }
+                let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
+                return save(file, *force, sensor, &model, json, &mut output);
             }
-            let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
-            save(file, *force, sensor, &model, *json, &mut output)
+            ModelOrder::Reset => Verb::Reset,
+            ModelOrder::Freeze => Verb::Freeze,
+            ModelOrder::Thaw => Verb::Thaw,
+            ModelOrder::Load { .. } => Verb::Load,
+        };
+        match &loaded {
+            Some(model) => request(places, &Request::load(sensor, model), &stop)?,
+            None => ask(verb)?,
+        };
+        let is_frozen = verb == Verb::Reset && !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();
+        confirm(&mut output, json, sensor, verb)?;
+        if is_frozen {
+            let hint = format!("it is frozen: nothing is learned until `scanhub background {sensor} thaw`");
+            quiet(output.line(|line| write!(line, "{hint}")))?;
         }
+        Ok(())
     }
 }
 

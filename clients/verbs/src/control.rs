@@ -4,6 +4,8 @@
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use scanhub_client::request;
 use scanhub_schema::{Failure, Request, Verb, check_sensor};
 use scanhub_shm::Domain;
@@ -12,36 +14,51 @@ use crate::json;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
 
-/// What `control` is asked for.
-#[derive(Clone, Debug)]
-pub struct ControlOptions {
-    /// The sensor.
-    pub sensor: String,
-    /// What its link shall do.
-    pub verb: Verb,
-    /// An object instead of text.
-    pub json: bool,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `control`.
+#[derive(Args, Clone, Debug)]
+pub struct ControlArgs {
+    /// The sensor
+    sensor: String,
+    /// pause: stop the sensor; resume: stream again; resync: restart the session with the sensor
+    #[arg(value_parser = verbs())]
+    verb: Verb,
 }
 
-/// Sends the request, waits until the link has taken it, and writes a line to `out`.
-///
-/// Failures as [`request`].
-pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    let ControlOptions { sensor, verb, .. } = options;
-    as_word(check_sensor(sensor))?;
-    request(&options.places, &Request::new(sensor, *verb), stop)?;
-    let mut output = Output::new(out);
-    quiet(if options.json {
-        output.json(&json::control(sensor, *verb))
+fn verbs() -> impl TypedValueParser<Value = Verb> {
+    PossibleValuesParser::new(Verb::FLOW.map(Verb::name))
+        .try_map(|word| Verb::parse(&word).ok_or("not a request"))
+}
+
+impl ControlArgs {
+    /// Sends the request to the hub in one of `places`, waits until the link has accepted it, and writes a line to `out`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`request`], and [`Kind::Usage`](scanhub_schema::Kind) if the sensor's name is not valid.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        as_word(check_sensor(&self.sensor))?;
+        request(places, &Request::new(&self.sensor, self.verb), stop)?;
+        confirm(&mut Output::new(out), json, &self.sensor, self.verb)
+    }
+}
+
+/// Writes the line that confirms an accepted request.
+pub(crate) fn confirm(output: &mut Output<'_>, json: bool, sensor: &str, verb: Verb) -> Result<(), Failure> {
+    quiet(if json {
+        output.json(&json::control(sensor, verb))
     } else {
-        output.line(|line| write!(line, "{sensor}: {}", done(*verb)))
+        output.line(|line| write!(line, "{sensor}: {}", done(verb)))
     })
 }
 
-/// Returns the past form of `verb`, for the line that confirms an accepted request.
-pub(crate) fn done(verb: Verb) -> &'static str {
+/// Returns the past form of `verb`.
+fn done(verb: Verb) -> &'static str {
     match verb {
         Verb::Pause => "paused",
         Verb::Resume => "resumed",

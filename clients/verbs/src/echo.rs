@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
 use scanhub_client::streams::Sample;
 use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
@@ -15,53 +16,74 @@ use crate::receive_stats::ReceiveStats;
 use crate::selection::Selection;
 use crate::{json, show, text};
 
-/// What `echo` is asked for.
-#[derive(Clone, Debug)]
-pub struct EchoOptions {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, at least one; CSV and bytes take exactly one.
+/// Arguments of `echo`.
+#[derive(Args, Clone, Debug, Default)]
+pub struct EchoArgs {
+    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics; robot/zones for the verdict over all
+    /// sensors
+    #[arg(required = true, value_name = "SENSOR/TOPIC")]
     pub topics: Vec<String>,
-    /// How samples are written.
-    pub format: Format,
-    /// When it ends by itself.
+    /// Print comma-separated values
+    #[arg(long, conflicts_with_all = ["json", "raw"])]
+    pub csv: bool,
+    /// With --csv: ranges in meters
+    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
+    pub meters: bool,
+    /// With --csv: columns intensity_0 .. after the ranges
+    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
+    pub intensities: bool,
+    /// Print raw bytes: telegrams, or the payload of another topic
+    #[arg(long, conflicts_with = "json")]
+    pub raw: bool,
+    /// Limits of the run.
+    #[command(flatten)]
     pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
 }
 
-/// How samples are written.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Format {
-    /// A line for people; notices go to `notes`.
-    #[default]
+impl EchoArgs {
+    /// Writes the samples of topics to `out` as they arrive. Notices go to `notes` (stderr) if `out` is not JSON. Ends at the
+    /// limits, when `stop` is set, or when the reader of `out` has closed it.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Usage`] if there is no such topic or the format does not go with the topics.
+    /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
+    /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let Selection { named, of_all } = Selection::parse(&self.topics)?;
+        let format = match (json, self.csv, self.raw) {
+            (true, ..) => Format::Json,
+            (_, true, _) => Format::Csv(ScanColumns { meters: self.meters, intensities: self.intensities }),
+            (_, _, true) => Format::Raw,
+            _ => Format::Text,
+        };
+        check(format, &named, &of_all)?;
+        let mut echo = Echo { format, out: Output::new(out), notes: Output::new(notes), beams: None };
+        let mut following = Following::new(&named, &of_all, places, &self.bounds, stop).with_lines();
+        let end = echo.run(&mut following);
+        quiet(following.finish(end, |name, stats| echo.summary(name, stats)))
+    }
+}
+
+/// Format of the samples.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Format {
+    /// A line of text; notices go to `notes`.
     Text,
-    /// An object per line, notices and summary too.
+    /// A JSON object per line, also for notices and summary.
     Json,
     /// Columns, scans only; notices and summary go to `notes`.
     Csv(ScanColumns),
-    /// The payloads' bytes, one after the other; notices and summary go to `notes`.
+    /// The bytes of the payloads, one after the other; notices and summary go to `notes`.
     Raw,
-}
-
-/// Writes the samples of topics to `out` as they come; what is no sample to `notes` (stderr) if `out` is not JSON.
-/// Ends when the bounds are reached, `stop` is set, or nobody reads any more.
-///
-/// [`Kind::Usage`] if there is no such topic or the format does not go with the topics, [`Kind::NoTopic`] with the sensors
-/// that there are,
-/// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
-/// `stop` came first.
-pub fn echo(
-    options: &EchoOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let Selection { named, of_all } = Selection::parse(&options.topics)?;
-    check(options.format, &named, &of_all)?;
-    let mut echo =
-        Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), beams: None };
-    let mut following = Following::new(&named, &of_all, &options.places, &options.bounds, stop).with_lines();
-    let end = echo.run(&mut following);
-    quiet(following.finish(end, |name, stats| echo.summary(name, stats)))
 }
 
 struct Echo<'a> {

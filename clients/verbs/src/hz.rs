@@ -6,6 +6,7 @@ use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use clap::Args;
 use scanhub_client::clock;
 use scanhub_schema::{Failure, Status, Topic};
 use scanhub_shm::Domain;
@@ -16,46 +17,62 @@ use crate::names::TopicName;
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
 use crate::selection::Selection;
-use crate::window::Window;
-use crate::{json, text};
+use crate::{duration, json, text};
 
-/// What `hz` is asked for.
-#[derive(Clone, Debug)]
-pub struct HzOptions {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`; none: all topics of the hub.
+/// Arguments of `hz`.
+#[derive(Args, Clone, Debug)]
+pub struct HzArgs {
+    /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
+    #[arg(value_name = "SENSOR/TOPIC")]
     pub topics: Vec<String>,
-    /// Objects instead of text.
-    pub json: bool,
-    /// The sliding window; ten seconds is a good one.
+    /// Time span that each line covers, at least 0.5s
+    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = parse_window)]
     pub window: Duration,
-    /// When it ends by itself.
+    /// Limits of the run.
+    #[command(flatten)]
     pub bounds: Bounds,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
 }
 
-/// Writes a line per topic and second to `out`, notices to `notes` (stderr) if `out` is not JSON, the summaries at the
-/// end. Ends and fails as [`echo`](crate::echo()).
-pub fn hz(
-    options: &HzOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let Selection { named, of_all } = Selection::parse(&options.topics)?;
-    let of_all = if options.topics.is_empty() { Topic::ALL.to_vec() } else { of_all };
-    let mut hz = Hz {
-        json: options.json,
-        length: options.window,
-        windows: Vec::new(),
-        lines: Vec::new(),
-        next: Instant::now() + EVERY,
-        out: Output::new(out),
-        notes: Output::new(notes),
-    };
-    let mut following = Following::new(&named, &of_all, &options.places, &options.bounds, stop).with_lines();
-    let end = hz.run(&mut following);
-    quiet(following.finish(end, |name, stats| hz.summary(name, stats)))
+/// Parses the time span of a line. A shorter one could never hold two samples that are far enough apart for a rate.
+fn parse_window(text: &str) -> Result<Duration, String> {
+    match duration::parse(text)? {
+        window if window >= MIN_WINDOW => Ok(window),
+        _ => Err(format!("{text:?} is too short for a rate: at least {MIN_WINDOW:?}")),
+    }
+}
+
+const MIN_WINDOW: Duration = Duration::from_millis(500);
+
+impl HzArgs {
+    /// Writes a line per topic and second to `out`, and summaries at the end. Notices go to `notes` (stderr) if `out` is not
+    /// JSON. Ends as [`EchoArgs::run`](crate::EchoArgs::run) does.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`EchoArgs::run`](crate::EchoArgs::run).
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let Selection { named, of_all } = Selection::parse(&self.topics)?;
+        let of_all = if self.topics.is_empty() { Topic::ALL.to_vec() } else { of_all };
+        let mut hz = Hz {
+            json,
+            length: self.window,
+            windows: Vec::new(),
+            lines: Vec::new(),
+            next: Instant::now() + EVERY,
+            out: Output::new(out),
+            notes: Output::new(notes),
+        };
+        let mut following = Following::new(&named, &of_all, places, &self.bounds, stop).with_lines();
+        let end = hz.run(&mut following);
+        quiet(following.finish(end, |name, stats| hz.summary(name, stats)))
+    }
 }
 
 const EVERY: Duration = Duration::from_secs(1);
@@ -232,5 +249,108 @@ impl<'a> Line<'a> {
             ),
             _ => write!(line, "{name:<16}        - Hz {} received", self.received),
         }
+    }
+}
+
+/// The arrivals of the last seconds.
+struct Window {
+    length: Duration,
+    arrivals: VecDeque<(Instant, u64)>,
+}
+
+/// What a window says; times between arrivals in ms.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Rate {
+    /// Arrivals per second.
+    hz: f64,
+    /// Standard deviation of the times between arrivals.
+    jitter_ms: f64,
+    /// The shortest time between two arrivals.
+    min_ms: f64,
+    /// The longest time between two arrivals.
+    max_ms: f64,
+}
+
+impl Window {
+    /// Remembers `length` of time.
+    fn new(length: Duration) -> Window {
+        Window { length, arrivals: VecDeque::new() }
+    }
+
+    /// Something arrived, `missed` before it did not.
+    fn arrived(&mut self, now: Instant, missed: u64) {
+        self.arrivals.push_back((now, missed));
+    }
+
+    /// Forgets what is older than the window.
+    fn slide(&mut self, now: Instant) {
+        while self.arrivals.front().is_some_and(|(at, _)| now - *at > self.length) {
+            self.arrivals.pop_front();
+        }
+    }
+
+    /// Arrivals in the window.
+    fn received(&self) -> u64 {
+        self.arrivals.len() as u64
+    }
+
+    /// What did not arrive between those in the window.
+    fn lost(&self) -> u64 {
+        self.arrivals.iter().map(|(_, missed)| missed).sum()
+    }
+
+    /// Returns the time from the first arrival in the window to the last.
+    fn span(&self) -> Duration {
+        match (self.arrivals.front(), self.arrivals.back()) {
+            (Some((first, _)), Some((last, _))) => *last - *first,
+            _ => Duration::ZERO,
+        }
+    }
+
+    /// Returns the rate, or `None` if the arrivals span less than [`scanhub_schema::MIN_RATE_SPAN`].
+    fn rate(&self) -> Option<Rate> {
+        let span = self.span();
+        let times_ms = || {
+            self.arrivals
+                .iter()
+                .zip(self.arrivals.iter().skip(1))
+                .map(|(a, b)| (b.0 - a.0).as_secs_f64() * 1e3)
+        };
+        let count = times_ms().count();
+        let hz = scanhub_schema::rate_hz(count as u64, span)?;
+        let mean = span.as_secs_f64() * 1e3 / count as f64;
+        let variance = times_ms().map(|time| (time - mean).powi(2)).sum::<f64>() / count as f64;
+        Some(Rate {
+            hz,
+            jitter_ms: variance.sqrt(),
+            min_ms: times_ms().fold(f64::INFINITY, f64::min),
+            max_ms: times_ms().fold(0.0, f64::max),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rate_of_a_window() {
+        let start = Instant::now();
+        let mut window = Window::new(Duration::from_secs(1));
+        assert_eq!(window.rate(), None);
+        let mut burst = Window::new(Duration::from_secs(1));
+        for at_us in [0, 1, 3] {
+            burst.arrived(start + Duration::from_micros(at_us), 0);
+        }
+        assert_eq!((burst.received(), burst.rate()), (3, None));
+        for (at_ms, missed) in [(0, 9), (500, 0), (600, 1), (800, 0), (1200, 0)] {
+            window.arrived(start + Duration::from_millis(at_ms), missed);
+        }
+        window.slide(start + Duration::from_millis(1200));
+        assert_eq!((window.received(), window.lost()), (4, 1));
+        let rate = window.rate().unwrap();
+        let expected = Rate { hz: 3.0 / 0.7, jitter_ms: 124.72, min_ms: 100.0, max_ms: 400.0 };
+        assert!((rate.hz - expected.hz).abs() < 1e-6 && (rate.jitter_ms - expected.jitter_ms).abs() < 0.01);
+        assert!((rate.min_ms - expected.min_ms).abs() < 1e-6 && (rate.max_ms - expected.max_ms).abs() < 1e-6);
     }
 }

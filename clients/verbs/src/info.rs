@@ -4,6 +4,7 @@ use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use clap::Args;
 use scanhub_client::clock;
 use scanhub_client::streams::{Follower, GRACE, Session, find};
 use scanhub_schema::{Counter, Failure, Family, Kind, Pose, Status, check_followed};
@@ -13,40 +14,48 @@ use crate::json;
 use crate::names::{as_word, no_sensor};
 use crate::output::{Output, quiet, table};
 
-/// What `info` is asked for.
-#[derive(Clone, Debug)]
-pub struct InfoOptions {
-    /// The sensor; none: all of them.
+/// Arguments of `info`.
+#[derive(Args, Clone, Debug)]
+pub struct InfoArgs {
+    /// Show only this sensor
     pub sensor: Option<String>,
-    /// Objects instead of text.
-    pub json: bool,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
 }
 
-/// Writes state, properties, counters and last error of the sensors to `out`.
-///
-/// [`Kind::NoHub`] within a second if there is none, [`Kind::NoTopic`] with the sensors that there are,
-/// [`Kind::Timeout`] if a sensor's status does not come, [`Kind::Interrupted`] if `stop` is set.
-pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    options.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    let domain = find(&options.places)?;
-    let sensors = wanted(options.sensor.as_deref(), &domain)?;
-    let now_ns = clock::now().monotonic_ns;
-    let mut output = Output::new(out);
-    for (sensor, status) in statuses(&domain, &sensors, stop)? {
-        let Some(status) = status else {
-            let hint = "the hub is there and does not publish: look at its log";
-            return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
-        };
-        quiet(if options.json {
-            output.json(&json::status(&sensor, &status))
-        } else {
-            table(&mut output, &properties(&sensor, &status, now_ns))
-                .and_then(|()| table(&mut output, &counters(&status)))
-        })?;
+impl InfoArgs {
+    /// Writes state, properties, counters and last error of the sensors to `out`.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::NoHub`] within a second if no hub runs.
+    /// - [`Kind::NoTopic`] if the sensor does not exist; the message lists the sensors.
+    /// - [`Kind::Timeout`] if a sensor's status does not arrive.
+    /// - [`Kind::Interrupted`] if `stop` is set.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        self.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+        let domain = find(places)?;
+        let sensors = wanted(self.sensor.as_deref(), &domain)?;
+        let now_ns = clock::now().monotonic_ns;
+        let mut output = Output::new(out);
+        for (sensor, status) in statuses(&domain, &sensors, stop)? {
+            let Some(status) = status else {
+                let hint = "the hub is there and does not publish: look at its log";
+                return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
+            };
+            quiet(if json {
+                output.json(&json::status(&sensor, &status))
+            } else {
+                table(&mut output, &properties(&sensor, &status, now_ns))
+                    .and_then(|()| table(&mut output, &counters(&status)))
+            })?;
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// The sensors to tell of. One that is not there may belong to a hub that is just starting.

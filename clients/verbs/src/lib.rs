@@ -4,7 +4,6 @@
 
 mod background;
 pub mod background_task;
-mod body;
 mod control;
 pub mod discovery;
 pub mod duration;
@@ -18,7 +17,6 @@ mod leds;
 mod line;
 mod list;
 pub mod lossy_writer;
-mod mask;
 pub mod names;
 pub mod output;
 mod receive_stats;
@@ -27,18 +25,18 @@ mod record;
 pub mod selection;
 pub mod show;
 pub mod text;
-mod window;
+mod zones;
 
-pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
-pub use control::{ControlOptions, control};
-pub use echo::{EchoOptions, Format, echo};
+pub use background::{BackgroundArgs, ModelOrder, saved_model};
+pub use control::ControlArgs;
+pub use echo::EchoArgs;
 pub use follow::Bounds;
-pub use hz::{HzOptions, hz};
-pub use info::{InfoOptions, info};
+pub use hz::HzArgs;
+pub use info::InfoArgs;
 pub use json::error as error_line;
 pub use latency::LatencyArgs;
 pub use leds::LedsArgs;
-pub use list::{ListOptions, list, list_domains};
-pub use mask::{MaskOptions, mask};
+pub use list::ListArgs;
 #[cfg(feature = "record")]
 pub use record::RecordArgs;
+pub use zones::ZonesArgs;

@@ -1,9 +1,10 @@
 //! `scanhub list`: what the running hub publishes, and which domains of this user are live.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use clap::Args;
 use scanhub_client::streams::find;
 use scanhub_schema::{Failure, Family, Pace, State, Status, Topic};
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
@@ -13,21 +14,45 @@ use serde::{Serialize, Serializer};
 use crate::info::statuses;
 use crate::output::{Output, quiet, table};
 
-/// What `list` is asked for.
-#[derive(Clone, Debug)]
-pub struct ListOptions {
-    /// Objects instead of a table.
-    pub json: bool,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `list`.
+#[derive(Args, Clone, Debug)]
+pub struct ListArgs {
+    /// List every live domain of this user instead
+    #[arg(long)]
+    pub domains: bool,
 }
 
-/// Writes the topics of every sensor of the hub to `out`, with rate, subscribers, payload type and revision. As text, the
-/// problem of each sensor that has one follows.
-///
-/// [`Kind::NoHub`](scanhub_schema::Kind) within a second if there is none, [`Kind::Interrupted`](scanhub_schema::Kind) if `stop` is set.
-pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    let domain = find(&options.places)?;
+impl ListArgs {
+    /// Writes the topics of every sensor of the hub of `domain` to `out`, with rate, subscribers, payload type and revision.
+    /// As text, the problem of each sensor that has one follows. The hub is below `root`, if given.
+    ///
+    /// With `--domains`, writes every live domain instead, those below `root` or all. Hubs that this user cannot reach follow,
+    /// with a command that does.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::NoHub`](scanhub_schema::Kind) within a second if no hub runs.
+    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if `stop` is set.
+    /// - The errors of [`Domain::candidates`], and that of a write to `out`.
+    pub fn run(
+        &self,
+        json: bool,
+        domain: &str,
+        root: Option<&Path>,
+        out: &mut dyn Write,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let environment = Environment::of_process();
+        match (self.domains, root) {
+            (false, _) => topics(json, &Domain::candidates(domain, root, &environment)?, out, stop),
+            (true, Some(root)) => domains(json, &[root.to_owned()], &[], out),
+            (true, None) => domains(json, &environment.bases(), &RunningHub::all(Path::new("/")), out),
+        }
+    }
+}
+
+fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    let domain = find(places)?;
     let node = scanhub_shm::client_node(&domain)?;
     let sensors = scanhub_shm::sensors(&domain)?;
     let (mut lines, mut problems) = (Vec::new(), Vec::new());
@@ -53,7 +78,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
         }
     }
     let mut output = Output::new(out);
-    if options.json {
+    if json {
         return quiet(lines.iter().try_for_each(|line| output.json(line)));
     }
     let mut rows = vec![["TOPIC", "HZ", "CONSUMERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
@@ -65,18 +90,9 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     )
 }
 
-/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](scanhub_shm::Environment::bases)) to `out`,
-/// including those of `hubs` below another directory. Hubs that this user cannot reach follow, with a command that does.
-///
-/// # Errors
-///
-/// Returns an error if `out` cannot be written to.
-pub fn list_domains(
-    bases: &[PathBuf],
-    hubs: &[RunningHub],
-    json: bool,
-    out: &mut dyn Write,
-) -> Result<(), Failure> {
+/// Writes every live domain below `bases`, and those of `hubs` below another directory. Hubs that this user cannot reach
+/// follow.
+fn domains(json: bool, bases: &[PathBuf], hubs: &[RunningHub], out: &mut dyn Write) -> Result<(), Failure> {
     #[derive(Serialize)]
     struct Line {
         class: &'static str,

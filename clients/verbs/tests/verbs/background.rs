@@ -9,10 +9,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crate::fake::Place;
-use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb};
+use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb, as_json};
 use scanhub_shm::ControlServer;
 use scanhub_shm::{Domain, HubLock};
-use scanhub_verbs::{BackgroundOptions, ModelOrder, background, saved_model};
+use scanhub_verbs::{BackgroundArgs, ModelOrder, saved_model};
 
 /// A hub that answers for the background of `front`.
 struct Keeper {
@@ -103,15 +103,19 @@ fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
 }
 
 fn ask(place: &Place, sensor: &str, order: ModelOrder, json: bool) -> (Result<(), Failure>, String) {
-    let options = BackgroundOptions { sensor: sensor.into(), order, json, places: place.places() };
+    let args = BackgroundArgs { sensor: sensor.into(), order };
     let mut out = Vec::new();
-    let end = background(&options, &mut out, &AtomicBool::new(false));
+    let end = args.run(json, &place.places(), &mut &b""[..], &mut out, || Ok(Arc::default()));
     (end, String::from_utf8(out).unwrap())
 }
 
 /// To save a model where nothing is yet.
 fn keep(file: &Path) -> ModelOrder {
     ModelOrder::Save { file: file.to_owned(), force: false }
+}
+
+fn load(file: &Path) -> ModelOrder {
+    ModelOrder::Load { file: file.to_owned(), any_sensor: false }
 }
 
 #[test]
@@ -134,7 +138,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     assert_eq!(say(ModelOrder::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
     let loaded = saved_model(&file, "front", false, &mut &b""[..]).unwrap();
     assert_eq!(loaded, model());
-    assert_eq!(say(ModelOrder::Load(loaded)), "front: background loaded\n");
+    assert_eq!(say(load(&file)), "front: background loaded\n");
     let (end, out) = ask(&place, "front", ModelOrder::Show, true);
     assert_eq!(end, Ok(()));
     assert_eq!(
@@ -173,7 +177,9 @@ fn what_does_not_go_with_the_sensor_is_refused() {
     assert!(saved_model(&file, "rear", true, &mut &b""[..]).is_ok());
 
     // The hub says what it has; here it is another resolution.
-    let refused = ask(&place, "front", ModelOrder::Load(model()), false).0.unwrap_err();
+    let other = place.base.join("other.json");
+    fs::write(&other, serde_json::to_vec(&as_json("front", &model())).unwrap()).unwrap();
+    let refused = ask(&place, "front", load(&other), false).0.unwrap_err();
     assert_eq!(
         (refused.kind, refused.message.as_str()),
         (Kind::Configuration, "front has 361 beams, the model 181")

@@ -5,24 +5,32 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
-use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Counter, Flags, Kind, Verdict};
-use scanhub_verbs::{Bounds, EchoOptions, Format, echo};
+use scanhub_verbs::{Bounds, EchoArgs};
 
 const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
-fn options(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> EchoOptions {
-    EchoOptions {
+#[derive(PartialEq)]
+pub(crate) enum Format {
+    Text,
+    Json,
+    Csv,
+    Raw,
+}
+
+fn args(topics: &[&str], format: &Format, bounds: Bounds) -> EchoArgs {
+    EchoArgs {
         topics: topics.iter().map(|&it| it.into()).collect(),
-        format,
+        csv: *format == Format::Csv,
+        raw: *format == Format::Raw,
         bounds,
-        places: place.places(),
+        ..EchoArgs::default()
     }
 }
 
-fn start(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> Verb {
-    let options = options(place, topics, format, bounds);
-    Verb::start(move |out, notes, stop| echo(&options, out, notes, stop))
+pub(crate) fn start(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> Verb {
+    let (args, places) = (args(topics, &format, bounds), place.places());
+    Verb::start(move |out, notes, stop| args.run(format == Format::Json, &places, out, notes, stop))
 }
 
 fn count(count: u64) -> Bounds {
@@ -89,7 +97,7 @@ fn telegrams_and_status_as_json() {
 fn scans_as_columns_and_as_bytes() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let csv = start(&place, &["front/scan"], Format::Csv(ScanColumns::default()), count(2));
+    let csv = start(&place, &["front/scan"], Format::Csv, count(2));
     let raw = start(&place, &["front/scan"], Format::Raw, count(1));
     hub.front().scan.await_subscribers(2);
     hub.front().scan(&[1000, 0x1FFF]);
@@ -238,7 +246,7 @@ fn what_the_hub_does_not_have() {
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
     for (topics, format, kind) in [
         (&["front/zone"][..], Format::Text, Kind::Usage),
-        (&["front/status"], Format::Csv(ScanColumns::default()), Kind::Usage),
+        (&["front/status"], Format::Csv, Kind::Usage),
         (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
         (&[], Format::Text, Kind::Usage),
     ] {
@@ -264,8 +272,9 @@ impl Write for Closed {
 fn a_reader_that_goes_away_is_a_quiet_end() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let options = options(&place, &["front/scan"], Format::Json, count(5));
-    let verb = Verb::start(move |_, notes, _| echo(&options, &mut Closed, notes, &AtomicBool::new(false)));
+    let (args, places) = (args(&["front/scan"], &Format::Json, count(5)), place.places());
+    let verb =
+        Verb::start(move |_, notes, _| args.run(true, &places, &mut Closed, notes, &AtomicBool::new(false)));
     hub.front().scan.await_subscribers(1);
     hub.front().scan(&[1]);
     assert_eq!(verb.join().0, Ok(()));

@@ -4,12 +4,13 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::child::{Child, spawn};
-use crate::fake::{FakeHub, Place, Verb, until};
+use crate::echo::{Format, start};
+use crate::fake::{FakeHub, Place, until};
 use scanhub_client::Subscription;
 use scanhub_schema::Scan;
 use scanhub_shm::PortFactory;
 use scanhub_shm::{Domain, holder};
-use scanhub_verbs::{Bounds, EchoOptions, Format, echo};
+use scanhub_verbs::Bounds;
 
 /// One turn of an LMS's mirror (75 Hz); it measures the half degrees one turn later.
 const TURN_NS: u64 = 13_320_000;
@@ -50,13 +51,7 @@ impl Hub {
 fn echo_goes_on_after_a_killed_hub() {
     let place = Place::new();
     let hub = Hub::start(&place, 1);
-    let options = EchoOptions {
-        topics: vec!["front/scan".into()],
-        format: Format::Json,
-        bounds: Bounds::default(),
-        places: place.places(),
-    };
-    let verb = Verb::start(move |out, notes, stop| echo(&options, out, notes, stop));
+    let verb = start(&place, &["front/scan"], Format::Json, Bounds::default());
     verb.out.await_lines(r#""boot":"0000000000000001""#, 10);
     hub.kill(&place);
     verb.out.await_lines("hub_gone", 1);

@@ -1,19 +1,21 @@
 //! `list`, `info` and `hz` with a hub and without one.
 
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
 use scanhub_schema::{Counter, Kind, Pose};
-use scanhub_verbs::{Bounds, HzOptions, InfoOptions, ListOptions, hz, info, list, list_domains};
+use scanhub_shm::DEFAULT_DOMAIN;
+use scanhub_verbs::{Bounds, HzArgs, InfoArgs, ListArgs};
 
 fn start_list(place: &Place, json: bool) -> Verb {
-    let options = ListOptions { json, places: place.places() };
-    Verb::start(move |out, _, stop| list(&options, out, stop))
+    let (domain, base) = (place.domain.name().to_owned(), place.base.clone());
+    Verb::start(move |out, _, stop| ListArgs { domains: false }.run(json, &domain, Some(&base), out, stop))
 }
 
 fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
-    let options = InfoOptions { sensor: sensor.map(Into::into), json, places: place.places() };
-    Verb::start(move |out, _, stop| info(&options, out, stop))
+    let (args, places) = (InfoArgs { sensor: sensor.map(Into::into) }, place.places());
+    Verb::start(move |out, _, stop| args.run(json, &places, out, stop))
 }
 
 #[test]
@@ -61,15 +63,18 @@ fn topics_of_a_hub() {
 #[test]
 fn live_domains() {
     let place = Place::new();
-    let mut out = Vec::new();
-    list_domains(std::slice::from_ref(&place.base), &[], true, &mut out).unwrap();
-    assert!(out.is_empty());
+    let list = || {
+        let mut out = Vec::new();
+        let args = ListArgs { domains: true };
+        args.run(true, DEFAULT_DOMAIN, Some(&place.base), &mut out, &AtomicBool::new(false)).unwrap();
+        String::from_utf8(out).unwrap()
+    };
+    assert_eq!(list(), "");
     let _hub = FakeHub::new(&place.domain, &[], 1);
-    list_domains(std::slice::from_ref(&place.base), &[], true, &mut out).unwrap();
     let (name, root, pid) = (place.domain.name(), place.domain.root().display(), std::process::id());
     let expected =
         format!("{{\"class\":\"domain\",\"domain\":\"{name}\",\"root\":\"{root}\",\"pid\":{pid}}}\n");
-    assert_eq!(String::from_utf8(out).unwrap(), expected);
+    assert_eq!(list(), expected);
 }
 
 #[test]
@@ -114,16 +119,11 @@ fn a_hub_that_says_nothing() {
 fn rates_of_all_topics() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let options = HzOptions {
-        topics: Vec::new(),
-        json: true,
-        window: Duration::from_secs(10),
-        bounds: Bounds::default(),
-        places: place.places(),
-    };
+    let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), bounds: Bounds::default() };
+    let places = place.places();
     // Statuses from before anybody followed them wait for whoever comes.
     hub.front().status(|_| {});
-    let verb = Verb::start(move |out, notes, stop| hz(&options, out, notes, stop));
+    let verb = Verb::start(move |out, notes, stop| args.run(true, &places, out, notes, stop));
     hub.front().scan.await_subscribers(1);
     // It follows the state of the line, too.
     hub.front().status.await_subscribers(2);

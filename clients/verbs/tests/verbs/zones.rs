@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use crate::echo::{Format, start};
 use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
 use scanhub_client::{RobotFollower, ZonesFollower};
 use scanhub_schema::{Kind, Verdict};
-use scanhub_verbs::{Bounds, EchoOptions, Format, HzOptions, echo, hz};
+use scanhub_verbs::{Bounds, HzArgs};
 
 /// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
 const PERIOD_US: u32 = 300_000;
@@ -88,24 +89,15 @@ fn the_newest_counts_and_what_waited_is_no_news() {
 fn echo_says_the_silence_too() {
     let place = Place::new();
     let mut hub = slow_hub(&place, &["front"], 0xAB);
-    let start = |topic: &str, format| {
-        let bounds = Bounds::default();
-        let options = EchoOptions { topics: vec![topic.into()], format, bounds, places: place.places() };
-        Verb::start(move |out, notes, stop| echo(&options, out, notes, stop))
-    };
-    let verbs = [
-        start("front/zones", Format::Json),
-        start("front/zones", Format::Text),
-        start("front/zones", Format::Raw),
-    ];
-    let rate = HzOptions {
+    let verbs = [Format::Json, Format::Text, Format::Raw]
+        .map(|format| start(&place, &["front/zones"], format, Bounds::default()));
+    let args = HzArgs {
         topics: vec!["front/zones".into()],
-        json: true,
         window: Duration::from_secs(10),
         bounds: Bounds::default(),
-        places: place.places(),
     };
-    let rate = Verb::start(move |out, notes, stop| hz(&rate, out, notes, stop));
+    let places = place.places();
+    let rate = Verb::start(move |out, notes, stop| args.run(true, &places, out, notes, stop));
     hub.front().zones.await_subscribers(4);
     hub.front().zones(Verdict::Stop, 420);
     verbs[0].out.await_lines(r#""stale":true"#, 1);
@@ -175,13 +167,8 @@ fn the_robot_is_the_worst_of_its_sensors() {
 fn echo_of_the_robot() {
     let place = Place::new();
     let mut hub = slow_hub(&place, &["rear", "front"], 1);
-    let options = EchoOptions {
-        topics: vec!["robot/zones".into()],
-        format: Format::Json,
-        bounds: Bounds { count: Some(3), ..Bounds::default() },
-        places: place.places(),
-    };
-    let verb = Verb::start(move |out, notes, stop| echo(&options, out, notes, stop));
+    let bounds = Bounds { count: Some(3), ..Bounds::default() };
+    let verb = start(&place, &["robot/zones"], Format::Json, bounds);
     hub.sensors.iter().for_each(|sensor| sensor.zones.await_subscribers(1));
     // There is nothing to say of all of them until each was heard.
     hub.sensors[1].zones(Verdict::Stop, 500);

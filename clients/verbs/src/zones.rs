@@ -1,92 +1,115 @@
 //! `scanhub zones SENSOR mask`: learns what a sensor sees of its own robot, and prints a configuration with which the
 //! hub ignores it. `body` decides what belongs to the robot. Printing changes nothing by itself.
 
+mod body;
+
 use std::fmt::Write as _;
 use std::io::Write;
 use std::rc::Rc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use clap::{Args, Subcommand};
 use scanhub_client::streams::Sample;
 use scanhub_schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
 use scanhub_shm::Domain;
 use serde::Serialize;
 
-use crate::body::{Body, Mask, SLICES, Sector};
+use self::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
-use crate::text;
+use crate::{duration, text};
 
-/// What `mask` is asked for.
-#[derive(Clone, Debug)]
-pub struct MaskOptions {
-    /// The sensor.
-    pub sensor: String,
-    /// How long to look.
-    pub run_for: Duration,
-    /// What is nearer than so many metres to the robot's centre may be its body; without it the largest circle of the
-    /// sensor's zones.
-    pub within_m: Option<f64>,
-    /// An object instead of TOML.
-    pub json: bool,
-    /// Where the domain may be, see [`Domain::candidates`].
-    pub places: Vec<Domain>,
+/// Arguments of `zones`.
+#[derive(Args, Clone, Debug)]
+pub struct ZonesArgs {
+    /// The sensor
+    sensor: String,
+    #[command(subcommand)]
+    order: Order,
 }
 
-/// Follows the sensor for a while, then writes its mask to `out` as TOML that a hub takes; what a person has to know of
-/// it to `notes` (stderr). `progress` is told what is going on,
-/// and nothing before a note.
-///
-/// [`Kind::Configuration`] if a value is not possible; [`Kind::NoHub`] and [`Kind::NoTopic`] as
-/// [`echo`](crate::echo()); [`Kind::Timeout`] if too few scans came; [`Kind::Failed`] if the hub went away or the sensor
-/// was set otherwise meanwhile; [`Kind::Interrupted`] if `stop` is set.
-pub fn mask(
-    options: &MaskOptions,
-    out: &mut dyn Write,
-    notes: &mut dyn Write,
-    progress: &mut dyn FnMut(Option<&str>),
-    stop: &AtomicBool,
-) -> Result<(), Failure> {
-    let MaskOptions { sensor, run_for, within_m, .. } = options;
-    as_word(check_sensor(sensor))?;
-    if let Some(within_m) = within_m.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
-        let message = format!("--within {within_m} is no radius");
-        return Err(Failure::new(Kind::Configuration, message, "metres from the robot's centre, at most 65"));
+#[derive(Clone, Debug, Subcommand)]
+enum Order {
+    /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
+    /// nobody near it
+    Mask {
+        /// How long to look, for example 10s
+        #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
+        run_for: Duration,
+        /// Only points within this distance (metres) of the robot's centre can be its body [default: the largest circle
+        /// of the zones]
+        #[arg(long, value_name = "RADIUS")]
+        within: Option<f64>,
+    },
+}
+
+impl ZonesArgs {
+    /// Follows the sensor for a while, then writes its mask to `out` as TOML for the hub, and doubts about it to `notes`
+    /// (stderr). Calls `progress` with the state of the run, and with nothing before a note.
+    ///
+    /// # Errors
+    ///
+    /// - [`Kind::Configuration`] if a value is not possible.
+    /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as [`EchoArgs::run`](crate::EchoArgs::run).
+    /// - [`Kind::Timeout`] if too few scans arrived.
+    /// - [`Kind::Failed`] if the hub went away, or the sensor's settings changed meanwhile.
+    /// - [`Kind::Interrupted`] if `stop` is set.
+    pub fn run(
+        &self,
+        json: bool,
+        places: &[Domain],
+        out: &mut dyn Write,
+        notes: &mut dyn Write,
+        progress: &mut dyn FnMut(Option<&str>),
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
+        let (sensor, Order::Mask { run_for, within }) = (&self.sensor, &self.order);
+        as_word(check_sensor(sensor))?;
+        if let Some(within_m) = within.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
+            let message = format!("--within {within_m} is no radius");
+            return Err(Failure::new(
+                Kind::Configuration,
+                message,
+                "metres from the robot's centre, at most 65",
+            ));
+        }
+        if run_for.is_zero() {
+            let message = "--for 0s measures nothing";
+            return Err(Failure::new(Kind::Configuration, message, "--for 10s is the default"));
+        }
+        let topics = [Topic::Status, Topic::Zones, Topic::Scan];
+        let names: Vec<_> =
+            topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
+        let bounds = Bounds { run_for: Some(*run_for), ..Bounds::default() };
+        let mut look = Look {
+            run_for: *run_for,
+            since: Instant::now(),
+            pose: None,
+            within_mm: within.map(|metres| 1000.0 * metres),
+            verdicts: 0,
+            violated: 0,
+            body: None,
+            notes: Output::new(notes),
+            progress,
+            told: 0,
+        };
+        quiet(look.run(&mut Following::new(&names, &[], places, &bounds, stop)))?;
+        let (body, within_mm) = look.seen(sensor)?;
+        let (scans, mask) = (body.scans(), body.mask());
+        let is_violated = look.is_violated();
+        let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
+        let Look { mut notes, progress, .. } = look;
+        progress(None);
+        quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
+        let mut output = Output::new(out);
+        quiet(if json {
+            output.json(&found.object())
+        } else {
+            found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
+        })
     }
-    if run_for.is_zero() {
-        let message = "--for 0s measures nothing";
-        return Err(Failure::new(Kind::Configuration, message, "--for 10s is the default"));
-    }
-    let topics = [Topic::Status, Topic::Zones, Topic::Scan];
-    let names: Vec<_> = topics.into_iter().map(|topic| TopicName { sensor: sensor.clone(), topic }).collect();
-    let bounds = Bounds { run_for: Some(*run_for), ..Bounds::default() };
-    let mut look = Look {
-        run_for: *run_for,
-        since: Instant::now(),
-        pose: None,
-        within_mm: within_m.map(|metres| 1000.0 * metres),
-        verdicts: 0,
-        violated: 0,
-        body: None,
-        notes: Output::new(notes),
-        progress,
-        told: 0,
-    };
-    quiet(look.run(&mut Following::new(&names, &[], &options.places, &bounds, stop)))?;
-    let (body, within_mm) = look.seen(sensor)?;
-    let (scans, mask) = (body.scans(), body.mask());
-    let is_violated = look.is_violated();
-    let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
-    let Look { mut notes, progress, .. } = look;
-    progress(None);
-    quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
-    let mut output = Output::new(out);
-    quiet(if options.json {
-        output.json(&found.object())
-    } else {
-        found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
-    })
 }
 
 /// What comes in while one looks.
