@@ -23,7 +23,7 @@ use crate::doctor::Hub;
 use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
 use crate::terminal::{Progress, print};
 use description::link_settings;
-pub use description::{Description, Found, Turning};
+use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 
 /// Arguments of `probe`.
@@ -452,7 +452,7 @@ fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> 
 
 /// A link for the scanner at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SuggestedLink {
+struct SuggestedLink {
     /// The port, by a name that does not change.
     port: String,
     /// Keys and values besides name and port.
@@ -470,18 +470,18 @@ impl SuggestedLink {
     }
 
     /// Returns the value of `--link`.
-    pub fn flag(&self) -> String {
+    fn flag(&self) -> String {
         let settings = self.settings.iter().map(|(key, value)| format!(",{key}={value}"));
         format!("{NAME}={}{}", self.port, settings.collect::<String>())
     }
 
     /// Returns the command that runs a hub for this scanner, as a shell takes it.
-    pub fn command(&self) -> String {
+    fn command(&self) -> String {
         format!("scanhub run --link {}", scanhub_shm::shell_word(&self.flag()))
     }
 
     /// Returns the section of a configuration file, without the end of its last line.
-    pub fn toml(&self) -> String {
+    fn toml(&self) -> String {
         let mut text = format!("[[link]]\nname = \"{NAME}\"\nport = {}", toml_string(&self.port));
         for (key, value) in &self.settings {
             let is_number = value.parse::<u32>().is_ok();

@@ -19,7 +19,7 @@ use crate::driver::DetectedScanner;
 /// The scanner at a port.
 #[derive(Clone, Debug, Serialize)]
 #[serde(untagged)]
-pub enum Found {
+pub(super) enum Found {
     /// A scanner that reports its settings on request.
     Asked(Box<Description>),
     /// A rotating scanner.
@@ -48,7 +48,7 @@ pub(crate) fn link_settings(report: &Report, rate: u32) -> Vec<(&'static str, St
 
 /// Description of an LMS. A value that it did not report is null.
 #[derive(Clone, Debug, Serialize)]
-pub struct Description {
+pub(super) struct Description {
     class: &'static str,
     port: String,
     family: &'static str,
@@ -91,7 +91,7 @@ struct Fault {
 
 impl Description {
     /// Creates the description of the LMS at `port` from its `report`.
-    pub fn new(port: String, report: &Report) -> Description {
+    pub(super) fn new(port: String, report: &Report) -> Description {
         let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
         let mut words = kind.iter().flat_map(|kind| kind.split(';')).map(|word| word.trim().to_owned());
         let (kind, number, firmware) = (words.next(), words.next(), words.next());
@@ -214,7 +214,7 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 
 /// Description of a rotating scanner. An unknown value is null.
 #[derive(Clone, Debug, Serialize)]
-pub struct Turning {
+pub(super) struct Turning {
     class: &'static str,
     port: String,
     family: &'static str,
