@@ -11,8 +11,7 @@ use scanhub_schema::{Tilt, Topic};
 
 use crate::boundary::{Lent, place, sample, text};
 use crate::call_error::{self, CallError};
-use crate::handle::Handle;
-use crate::mount::Mount;
+use crate::handle::{Handle, Mount};
 use crate::table::{self, Opaque};
 
 /// Begins to follow a topic; answers 0.

@@ -1,30 +1,33 @@
-//! A subscription as C sees it: of any topic, with a sample that a wait found and nobody took yet, and those that are lent.
+//! Objects behind the handles of a C program: a subscription to any topic, with the samples that are lent to the
+//! program, and a mount whose angles the program publishes.
 
-use std::ffi::c_int;
+use std::ffi::{CString, c_char, c_int};
 use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use scanhub_client::{Domain, Heard, Payload, Received, RobotFollower, Subscription, Wait, ZonesFollower};
-use scanhub_schema::{Failure, Header, Topic, limits};
+use scanhub_client::{
+    Domain, Heard, Payload, Publication, Received, Robot, RobotFollower, Subscription, Wait, ZonesFollower,
+    home,
+};
+use scanhub_schema::{Failure, Header, Tilt, Topic, limits};
 
 use crate::boundary::Lent;
 use crate::call_error::CallError;
-use crate::robot::Told;
 
 /// An open subscription.
 pub(crate) struct Handle {
-    // Before the source: they are given back to it.
+    // Dropped before the source that lends the samples.
     lent: [Option<(u64, Held)>; LENT],
     found: Option<Held>,
     next: u64,
     source: Source,
 }
 
-/// Samples that may be lent at a time, as many as the hub has in store for each consumer.
+/// Maximum number of samples that are lent at a time: as many as a subscriber can borrow from the hub.
 const LENT: usize = limits::BORROWED;
 
-/// Zones are followed with an eye on their age, all else as it comes.
+/// Type that follows a topic: zones expire, other samples do not.
 macro_rules! follower {
     (Zones $payload:tt) => {
         ZonesFollower
@@ -34,7 +37,7 @@ macro_rules! follower {
     };
 }
 
-/// A sample of such.
+/// Type of a sample of a topic.
 macro_rules! sample {
     (Zones $payload:tt) => {
         Heard
@@ -44,7 +47,7 @@ macro_rules! sample {
     };
 }
 
-/// Declares what is followed from the table of topics; a robot is all zones in one.
+/// Declares the sources and samples from the table of topics. A robot combines the zones of its sensors.
 macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         enum Source { Robot(RobotFollower), $($topic(follower!($topic $payload)),)* }
@@ -102,7 +105,7 @@ macro_rules! topics {
 
 scanhub_schema::for_each_topic!(topics);
 
-/// What a program in C sees of a sample.
+/// Converts a sample to the struct that a program in C reads.
 trait Lend {
     fn lend(&self) -> Lent;
 }
@@ -127,7 +130,7 @@ impl<P: Payload + ?Sized> Lend for Received<P> {
 }
 
 impl Handle {
-    /// Will follow `topic` of `sensor` in the first live one of `places`.
+    /// Follows `topic` of `sensor` in the first live one of `places`.
     pub(crate) fn open(
         places: Vec<Domain>,
         sensor: &str,
@@ -137,7 +140,8 @@ impl Handle {
         Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
     }
 
-    /// Will follow the robot of `sensors` (none: all) in the first live one of `places`, with its `early` warnings or without.
+    /// Follows the robot of `sensors` (if empty: all) in the first live one of `places`, with or without `early`
+    /// warnings.
     pub(crate) fn open_robot(
         places: Vec<Domain>,
         sensors: &[&str],
@@ -152,7 +156,7 @@ impl Handle {
         Handle { lent: Default::default(), found: None, next: 1, source }
     }
 
-    /// Waits until there is a sample to take, or `timeout` is over (none: never); whether there is.
+    /// Waits until there is a sample to take, but not longer than `timeout`. Returns whether there is a sample.
     pub(crate) fn wait(&mut self, timeout: Option<Duration>) -> Result<bool, CallError> {
         let until = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
@@ -170,14 +174,14 @@ impl Handle {
         }
     }
 
-    /// The next sample, lent until it is given back; nothing if none waits.
+    /// Lends the next sample until it is given back. Returns `None` if no sample has arrived.
     pub(crate) fn take(&mut self) -> Result<Option<Lent>, CallError> {
         let place = self.lent.iter_mut().find(|place| place.is_none());
         let Some(place) = place else {
             return Err(CallError::Argument("four samples are lent already", "scanhub_release one of them"));
         };
         let held = match self.found.take() {
-            // A verdict is of now: the caller may have waited, and it has no stamp.
+            // A verdict has no stamp, and the caller may have waited, so it must be current.
             Some(Held::Robot(found)) => match &mut self.source {
                 Source::Robot(robot) => Held::Robot(Told::new(robot.now()?)),
                 _ => Held::Robot(found),
@@ -194,7 +198,7 @@ impl Handle {
         Ok(Some(Lent { number: *number, ..held.lend() }))
     }
 
-    /// Takes the sample back that was lent under `number`.
+    /// Takes back the sample that was lent under `number`.
     pub(crate) fn give_back(&mut self, number: u64) -> Result<(), CallError> {
         let is_it =
             |place: &&mut Option<(u64, Held)>| place.as_ref().is_some_and(|(lent, _)| *lent == number);
@@ -222,5 +226,83 @@ impl Lent {
             length,
             ..Lent::none()
         }
+    }
+}
+
+/// `scanhub_robot` of the header.
+#[repr(C)]
+struct Verdict {
+    verdict: u8,
+    nearest_mm: u32,
+    worst: *const c_char,
+    nearest: *const c_char,
+    count: usize,
+    sensors: *const OfSensor,
+}
+
+/// `scanhub_robot_sensor` of the header.
+#[repr(C)]
+struct OfSensor {
+    name: *const c_char,
+    verdict: u8,
+    nearest_mm: u32,
+}
+
+/// The verdict of a robot, and the memory that it points to: C may read it while it is lent.
+struct Told {
+    verdict: Verdict,
+    _sensors: Box<[OfSensor]>,
+    _names: Vec<CString>,
+}
+
+impl Told {
+    fn new(robot: &Robot) -> Told {
+        // Names have no 0 in them.
+        let names: Vec<CString> =
+            robot.zones().map(|(name, _)| CString::new(name).unwrap_or_default()).collect();
+        let of_sensor = |((_, zones), name): ((&str, &scanhub_schema::Zones), &CString)| OfSensor {
+            name: name.as_ptr(),
+            verdict: zones.verdict() as u8,
+            nearest_mm: zones.nearest().map_or(NOTHING_MM, |(_, mm)| mm),
+        };
+        let sensors: Box<[OfSensor]> = robot.zones().zip(&names).map(of_sensor).collect();
+        let called = |wanted: Option<&str>| {
+            let at = robot.zones().position(|(name, _)| Some(name) == wanted);
+            at.map_or(ptr::null(), |at| names[at].as_ptr())
+        };
+        let nearest = robot.nearest();
+        let verdict = Verdict {
+            verdict: robot.verdict() as u8,
+            nearest_mm: nearest.map_or(NOTHING_MM, |(mm, _)| mm),
+            worst: called(robot.worst()),
+            nearest: called(nearest.map(|(_, name)| name)),
+            count: sensors.len(),
+            sensors: sensors.as_ptr(),
+        };
+        Told { verdict, _sensors: sensors, _names: names }
+    }
+
+    /// Returns what is lent. The memory that it points to lives as long as `self`.
+    fn verdict(&self) -> &Verdict {
+        &self.verdict
+    }
+}
+
+/// SCANHUB_NOTHING_MM of the header.
+const NOTHING_MM: u32 = u32::MAX;
+
+/// A mount whose angles are published.
+pub(crate) struct Mount(Publication<Tilt>);
+
+impl Mount {
+    /// Publishes as `name` in `domain`, or in the domain that the environment names.
+    pub(crate) fn publish(domain: Option<&str>, name: &str) -> Result<Mount, CallError> {
+        Ok(Mount(Publication::in_domain(&home(domain)?, name)?))
+    }
+
+    /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC; 0 means now.
+    pub(crate) fn send(&mut self, stamp_ns: u64, tilt: Tilt) -> Result<(), CallError> {
+        let fill = |sample: &mut Tilt| *sample = tilt;
+        Ok(if stamp_ns == 0 { self.0.send(fill) } else { self.0.send_at(stamp_ns, fill) }?)
     }
 }

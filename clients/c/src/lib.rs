@@ -1,13 +1,10 @@
-//! The client library for programs in C and C++: `include/scanhub/attach.h` is its contract, this is what stands behind it.
-//! A handle is a number, not an address: one that was closed, or is another thread's, is found out and not followed.
-//! Refuses to know how samples come: that is `scanhub_client`.
+//! The client library for programs in C and C++. It implements `include/scanhub/attach.h` on top of `scanhub_client`. A
+//! handle is a number, not an address, so the library detects a handle that was closed or belongs to another thread.
 
 mod boundary;
 mod call_error;
 mod export;
 mod handle;
-mod mount;
-mod robot;
 mod table;
 
 pub use boundary::Lent;
