@@ -1,7 +1,6 @@
 //! A Zenoh session, and nothing of scanhub: a background thread opens it, publishers, tokens, subscribers and queryables
 //! belong to it, and it reports the events of its links. Payloads are bytes here.
 
-mod certificate;
 mod config;
 mod log;
 

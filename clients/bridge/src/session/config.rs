@@ -1,14 +1,14 @@
-//! Zenoh's configuration: its own configuration file, the addresses that the user named, and limits for what the file does
-//! not set. A session listens and searches only if the user or the file enables that.
+//! Zenoh's configuration: its own configuration file, the addresses that the user named, and limits for what the file
+//! does not set. A session listens and searches only if the user or the file enables that.
 
 use std::path::Path;
 
 use scanhub_files::regular;
 use scanhub_schema::{Failure, Kind};
+use x509_parser::pem::Pem;
 use zenoh::Config;
 use zenoh::config::{EndPoint, WhatAmI};
 
-use super::certificate::{Unusable, check_key, check_own, check_trusted};
 use super::log::without_places;
 use crate::BridgeOptions;
 
@@ -21,8 +21,9 @@ pub(crate) struct CheckedConfig {
 
 /// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
 ///
-/// Zenoh's own values are made for throughput: samples in long queues are old on a slow link. A message that finds no room
-/// waits in this session, while newer samples replace the samples in the queue. A router on the way has values of its own.
+/// Zenoh's own values are made for throughput: samples in long queues are old on a slow link. A message that finds no
+/// room waits in this session, while newer samples replace the samples in the queue. A router on the way has values of
+/// its own.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -33,20 +34,21 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/unicast/max_sessions", "64"),
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
-    // A sample leaves at once, as with Zenoh's `express`. That one would also hold for routers on the way, which have room for
-    // two batches, and drop the third.
+    // A sample leaves at once, as with Zenoh's `express`. That one would also hold for routers on the way, which have
+    // room for two batches, and drop the third.
     ("transport/link/tx/queue/batching/enabled", "false"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
     ("transport/link/tls/so_sndbuf", "8192"),
 ];
 
-/// Time for which a message waits for room before Zenoh drops it, and every later one until there is room, in microseconds:
-/// of a client, and of a router or peer. The second key is the time that a message in fragments waits beyond that.
+/// Time for which a message waits for room before Zenoh drops it, and every later one until there is room, in
+/// microseconds: of a client, and of a router or peer. The second key is the time that a message in fragments waits
+/// beyond that.
 ///
-/// A client has one link. It waits as long as a link without data lives (10 s), so that it drops nothing unless the link
-/// breaks. A longer wait would delay the end of a dead link, because the wait holds a lock of Zenoh. A router may have many
-/// links, and one that stalls must not delay the others.
+/// A client has one link. It waits as long as a link without data lives (10 s), so that it drops nothing unless the
+/// link breaks. A longer wait would delay the end of a dead link, because the wait holds a lock of Zenoh. A router may
+/// have many links, and one that stalls must not delay the others.
 const WAIT: [(&str, [&str; 2]); 2] = [
     ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
     ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
@@ -79,8 +81,8 @@ impl CheckedConfig {
     ///
     /// # Errors
     ///
-    /// [`Kind::Input`] if the file cannot be read. [`Kind::Configuration`] if the file or an address is invalid, if there is
-    /// neither a router nor an address to listen on, or if a certificate has expired.
+    /// [`Kind::Input`] if the file cannot be read. [`Kind::Configuration`] if the file or an address is invalid, if
+    /// there is neither a router nor an address to listen on, or if a certificate has expired.
     pub(crate) fn read(options: &BridgeOptions, now_s: i64) -> Result<CheckedConfig, Failure> {
         let mut config = options.config.as_deref().map_or_else(|| Ok(Config::default()), read)?;
         let unsaid = Config::default();
@@ -202,6 +204,69 @@ fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Resul
     .map_err(|Unusable { why, remedy }| refuse(why, remedy))
 }
 
+/// Reason why the file of a certificate or key cannot be used. The files are checked before Zenoh opens them: it does
+/// that only when it connects, and reports an expired certificate with the message of the other side.
+struct Unusable {
+    why: String,
+    remedy: &'static str,
+}
+
+/// Checks that the first certificate in `text`, which this machine shows, is valid `now_s` seconds after 1970.
+fn check_own(text: &[u8], now_s: i64) -> Result<(), Unusable> {
+    judge(&certificates(text)?[0], now_s)
+}
+
+/// Checks that one of the certificates in `text`, which this machine trusts, is valid `now_s` seconds after 1970. A
+/// list may have expired ones.
+fn check_trusted(text: &[u8], now_s: i64) -> Result<(), Unusable> {
+    let certificates = certificates(text)?;
+    let is_good = certificates[1..].iter().any(|block| judge(block, now_s).is_ok());
+    judge(&certificates[0], now_s).or_else(|unusable| if is_good { Ok(()) } else { Err(unusable) })
+}
+
+/// Checks that `text` has a private key.
+fn check_key(text: &[u8]) -> Result<(), Unusable> {
+    if blocks(text)?.iter().any(|block| block.label.ends_with("PRIVATE KEY")) {
+        return Ok(());
+    }
+    Err(Unusable { why: "there is no private key in it".into(), remedy: NO_PEM })
+}
+
+/// Remedy for a file without the certificate or key that it must have.
+const NO_PEM: &str = "it has to be a file in PEM, as openssl writes it (docs/bridge.md)";
+
+/// Returns the certificates in `text`, at least one.
+fn certificates(text: &[u8]) -> Result<Vec<Pem>, Unusable> {
+    let mut blocks = blocks(text)?;
+    blocks.retain(|block| block.label == "CERTIFICATE");
+    if blocks.is_empty() {
+        return Err(Unusable { why: "there is no certificate in it".into(), remedy: NO_PEM });
+    }
+    Ok(blocks)
+}
+
+fn judge(block: &Pem, now_s: i64) -> Result<(), Unusable> {
+    let certificate = block.parse_x509().map_err(|error| {
+        let why = format!("it has a certificate that cannot be read: {error}");
+        Unusable { why, remedy: NO_PEM }
+    })?;
+    let (validity, who) = (certificate.validity(), certificate.subject());
+    if now_s > validity.not_after.timestamp() {
+        let why = format!("the certificate of {who} expired at {}", validity.not_after);
+        return Err(Unusable { why, remedy: "renew it, as docs/bridge.md shows" });
+    }
+    if now_s < validity.not_before.timestamp() {
+        let why = format!("the certificate of {who} is not valid before {}", validity.not_before);
+        return Err(Unusable { why, remedy: "set the clock of this machine, or of the one that made it" });
+    }
+    Ok(())
+}
+
+fn blocks(text: &[u8]) -> Result<Vec<Pem>, Unusable> {
+    let blocks: Result<Vec<Pem>, _> = Pem::iter_from_buffer(text).collect();
+    blocks.map_err(|error| Unusable { why: format!("it cannot be read: {error}"), remedy: NO_PEM })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -296,5 +361,36 @@ mod tests {
             failure.message.contains("/nowhere/ca.pem") && failure.message.contains("root_ca"),
             "{failure}"
         );
+    }
+
+    /// Made by openssl: from 2026-01-01 to 2026-01-02, for CN=robot.
+    const CERTIFICATE: &[u8] = include_bytes!("certificate/expired.pem");
+    /// 2026-01-01, in seconds.
+    const SINCE_S: i64 = 1_767_225_600;
+    const DAY_S: i64 = 86_400;
+
+    #[test]
+    fn a_certificate_is_good_from_its_first_to_its_last_second() {
+        let refused = |now_s| check_own(CERTIFICATE, now_s).err().map(|unusable| unusable.why);
+        assert_eq!([SINCE_S, SINCE_S + DAY_S].map(refused), [None, None]);
+        let expired = refused(SINCE_S + DAY_S + 1).unwrap();
+        assert_eq!(expired, "the certificate of CN=robot expired at Jan  2 00:00:00 2026 +00:00");
+        let early = refused(SINCE_S - 1).unwrap();
+        assert_eq!(early, "the certificate of CN=robot is not valid before Jan  1 00:00:00 2026 +00:00");
+    }
+
+    #[test]
+    fn what_is_no_certificate_or_no_key_is_told() {
+        let why = |unusable: Result<(), Unusable>| unusable.err().map(|unusable| unusable.why);
+        assert_eq!(why(check_key(CERTIFICATE)).as_deref(), Some("there is no private key in it"));
+        let key = b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n";
+        assert_eq!(why(check_key(key)), None);
+        let none = why(check_trusted(key, SINCE_S));
+        assert_eq!(none.as_deref(), Some("there is no certificate in it"));
+        assert!(why(check_trusted(b"nonsense\n", SINCE_S)).is_some());
+        let cut = &CERTIFICATE[..CERTIFICATE.len() / 2];
+        assert!(why(check_trusted(cut, SINCE_S)).is_some());
+        let torn = b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n";
+        assert!(why(check_trusted(torn, SINCE_S)).unwrap().contains("cannot be read"));
     }
 }
