@@ -10,10 +10,9 @@ use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
 use scanhub_shm::Domain;
 
 use crate::follow::{Bounds, Event, Following};
-use crate::names::TopicName;
+use crate::names::{Selection, TopicName};
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
-use crate::selection::Selection;
 use crate::{json, show, text};
 
 /// Arguments of `echo`.

@@ -11,10 +11,10 @@ use scanhub_schema::{Failure, Kind, Status, Topic, is_remote};
 use scanhub_shm::Domain;
 
 use crate::discovery::Discovery;
-use crate::line::{Line, Loss};
 use crate::names::{TopicName, no_sensor, no_such_topic};
 use crate::output::{End, Output};
 pub use crate::receive_stats::ReceiveStats;
+use crate::receive_stats::{Line, Loss};
 use crate::{json, text};
 
 /// Limits after which a verb ends by itself: arguments of every verb that follows topics.

@@ -13,10 +13,9 @@ use scanhub_shm::Domain;
 use serde::Serialize;
 
 use crate::follow::{Bounds, Event, Following, Notice};
-use crate::names::TopicName;
+use crate::names::{Selection, TopicName};
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
-use crate::selection::Selection;
 use crate::{duration, json, text};
 
 /// Arguments of `hz`.

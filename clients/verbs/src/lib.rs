@@ -3,7 +3,6 @@
 //! to stop is a flag.
 
 mod background;
-pub mod background_task;
 mod control;
 pub mod discovery;
 pub mod duration;
@@ -14,7 +13,6 @@ mod info;
 pub mod json;
 mod latency;
 mod leds;
-mod line;
 mod list;
 pub mod lossy_writer;
 pub mod names;
@@ -22,7 +20,6 @@ pub mod output;
 mod receive_stats;
 #[cfg(feature = "record")]
 mod record;
-pub mod selection;
 pub mod show;
 pub mod text;
 mod zones;
@@ -40,3 +37,6 @@ pub use list::ListArgs;
 #[cfg(feature = "record")]
 pub use record::RecordArgs;
 pub use zones::ZonesArgs;
+
+#[cfg(feature = "record")]
+use names as selection;

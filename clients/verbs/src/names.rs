@@ -1,8 +1,8 @@
-//! `SENSOR/TOPIC` on the command line, and the error if it does not exist.
+//! Names of topics on the command line: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`, and the error if one does not exist.
 
 use std::fmt;
 
-use scanhub_schema::{Failure, Kind, ROBOT, Topic, check_followed};
+use scanhub_schema::{Failure, Kind, Maker, ROBOT, Topic, check_followed};
 
 /// One topic of one sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,12 +61,12 @@ pub fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
 }
 
 /// All topics of a sensor.
-pub fn topics() -> String {
+fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
 /// The topic that `word` may have been meant for, if one is near.
-pub fn nearest(sensor: &str, word: &str) -> String {
+fn nearest(sensor: &str, word: &str) -> String {
     let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
@@ -103,10 +103,90 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
 }
 
+/// What one word stands for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Word {
+    /// The sensor; nothing: all of them.
+    pub sensor: Option<String>,
+    /// The topic; nothing: all of them.
+    pub topic: Option<Topic>,
+}
+
+impl Word {
+    /// What `text` stands for; `robot/zones` is the fold over all sensors.
+    ///
+    /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
+    pub fn parse(text: &str) -> Result<Word, Failure> {
+        let (sensor, topic) = text.split_once('/').unwrap_or((text, ""));
+        match (sensor, topic) {
+            (ALL, ALL) => Ok(Word { sensor: None, topic: None }),
+            (ALL, topic) => match Topic::parse(topic) {
+                Some(topic) => Ok(Word { sensor: None, topic: Some(topic) }),
+                None => {
+                    let hint = format!("{}{}", nearest(ALL, topic), topics());
+                    Err(Failure::new(Kind::Usage, format!("no topic {text:?}"), hint))
+                }
+            },
+            (ROBOT, ALL) => {
+                let hint = format!(
+                    "*/* names all topics of all sensors, {ROBOT}/zones the verdict over all sensors"
+                );
+                Err(Failure::new(Kind::Usage, format!("{text} is not possible"), hint))
+            }
+            (sensor, ALL) => {
+                as_word(check_followed(sensor))?;
+                Ok(Word { sensor: Some(sensor.to_owned()), topic: None })
+            }
+            _ => {
+                let TopicName { sensor, topic } = TopicName::parse(text)?;
+                Ok(Word { sensor: Some(sensor), topic: Some(topic) })
+            }
+        }
+    }
+}
+
+/// What several words stand for together.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Selection {
+    /// Topics of sensors that are named, each once, in the order of the words.
+    pub(crate) named: Vec<TopicName>,
+    /// Topics of all sensors, each once, in their own order.
+    pub(crate) of_all: Vec<Topic>,
+}
+
+impl Selection {
+    /// What `texts` stand for; nothing said is nothing selected. Failures as of [`Word::parse`].
+    pub(crate) fn parse(texts: &[String]) -> Result<Selection, Failure> {
+        let mut named: Vec<TopicName> = Vec::new();
+        let mut of_all = Vec::new();
+        for text in texts {
+            let word = Word::parse(text)?;
+            // Who made a name's topics is known when they are there: one that is named has what a link has.
+            let may_have = |topic: Topic| word.sensor.is_none() || topic.maker() == Maker::Link;
+            let is_meant = |topic: &Topic| word.topic.map_or(may_have(*topic), |known| known == *topic);
+            let meant = Topic::ALL.into_iter().filter(is_meant);
+            match &word.sensor {
+                None => of_all.extend(meant),
+                Some(sensor) => named.extend(meant.map(|topic| TopicName { sensor: sensor.clone(), topic })),
+            }
+        }
+        let mut once: Vec<TopicName> = Vec::new();
+        for name in named {
+            if !once.contains(&name) {
+                once.push(name);
+            }
+        }
+        let of_all = Topic::ALL.into_iter().filter(|topic| of_all.contains(topic)).collect();
+        Ok(Selection { named: once, of_all })
+    }
+}
+
+/// Stands for all sensors, or all topics.
+const ALL: &str = "*";
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_schema::Maker;
 
     #[test]
     fn names() {
@@ -137,5 +217,48 @@ mod tests {
         let failure = no_such_topic(&name, Maker::Tracker.topics());
         assert_eq!(failure.message, "there is no topic house/scan: house is a tracker");
         assert_eq!(failure.hint, "there are house/tracks, house/events");
+    }
+
+    fn selection(texts: &[&str]) -> (Vec<String>, Vec<Topic>) {
+        let texts: Vec<_> = texts.iter().map(|&text| text.to_owned()).collect();
+        let selection = Selection::parse(&texts).unwrap();
+        (selection.named.iter().map(TopicName::to_string).collect(), selection.of_all)
+    }
+
+    #[test]
+    fn a_word_may_stand_for_all() {
+        assert_eq!(selection(&["*/scan"]), (vec![], vec![Topic::Scan]));
+        let front: Vec<_> = Topic::OF_LINKS.iter().map(|topic| format!("front/{}", topic.name())).collect();
+        assert_eq!(selection(&["front/*"]), (front, vec![]));
+        assert_eq!(selection(&["*/*"]), (vec![], Topic::ALL.to_vec()));
+        assert_eq!(selection(&["robot1.front/scan"]), (vec!["robot1.front/scan".into()], vec![]));
+        assert_eq!(
+            selection(&["*/status", "robot/zones", "front/scan", "*/scan", "front/scan"]),
+            (vec!["robot/zones".into(), "front/scan".into()], vec![Topic::Scan, Topic::Status])
+        );
+        assert_eq!(selection(&[]), (vec![], vec![]));
+    }
+
+    #[test]
+    fn what_is_no_topic_is_refused_with_what_there_is() {
+        let refused = |text: &str| Word::parse(text).unwrap_err();
+        for bad in [
+            "*",
+            "*/",
+            "*/scam",
+            "front",
+            "front/",
+            "front/scam",
+            "/scan",
+            "robot/*",
+            "robot/scan",
+            "",
+            "Front/*",
+        ] {
+            assert_eq!(refused(bad).kind, Kind::Usage, "{bad}");
+        }
+        assert!(refused("*/backgroud").hint.starts_with("did you mean */background? topics are "));
+        assert!(refused("*").hint.starts_with("topics are "));
+        assert!(refused("robot/*").hint.contains("robot/zones"));
     }
 }

@@ -1,25 +1,22 @@
 //! The classes of `--json` as text for people: one line per sample, the most important values first. Not a contract.
 
-mod people;
-mod processed;
-mod tilted;
-
 use std::f64::consts::TAU;
 use std::fmt;
 use std::io::{self, Write};
 use std::rc::Rc;
 
 use scanhub_client::streams::Sample;
-use scanhub_schema::{Failure, Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
+use scanhub_client::{Heard, Robot};
+use scanhub_schema::{
+    Background, BackgroundHead, Cloud, Early, Event, EventKind, Failure, Flags, Foreground, Header, Lines,
+    Marks, Motion, Obstacle, Obstacles, PacketFacts, PointClass, Reasons, Scan, Status, Telegram, Tilt,
+    Tracks, Verdict, in_degrees,
+};
 
 use crate::follow::Notice;
 use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
-
-pub use people::*;
-pub(crate) use processed::*;
-pub use tilted::*;
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -143,4 +140,283 @@ pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
         write!(line, " last error: {}", status.last_error())?;
     }
     Ok(())
+}
+
+pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
+    numbers(line, header)?;
+    if marks.lacks_level() {
+        let why = "unavailable: nobody said from which intensity on this scanner sees a reflector";
+        return write!(line, " {why}: set link.NAME.marks.level");
+    }
+    if !marks.is_available() {
+        // A sample does not tell whether the mode of a recording is known; `info` does.
+        return if header.flags & Flags::REPLAYED != 0 {
+            write!(
+                line,
+                " unavailable: the recording has no reflector bits, or does not contain its measuring mode: "
+            )?;
+            write!(line, "then set link.NAME.mode")
+        } else {
+            write!(line, " unavailable: the sensor's measuring mode has no reflector bits")
+        };
+    }
+    let count = marks.marks().len();
+    write!(line, " {count} {}", if count == 1 { "mark" } else { "marks" })?;
+    for mark in marks.marks() {
+        let (angle_deg, range_mm) = (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
+        write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;
+    }
+    if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(crate) fn lines(line: &mut Vec<u8>, header: &Header, lines: &Lines) -> io::Result<()> {
+    numbers(line, header)?;
+    let count = lines.lines().len();
+    write!(
+        line,
+        " {count} {}, {} corners",
+        if count == 1 { "line" } else { "lines" },
+        lines.corners().len()
+    )?;
+    write!(line, ", {} of {} beams", lines.on_lines, lines.readings)?;
+    for found in lines.lines() {
+        let (r_m, alpha_deg) = (found.r_m, found.alpha_rad.to_degrees());
+        write!(line, ", r {r_m:.3} m alpha {alpha_deg:.2} deg")?;
+    }
+    if lines.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {}", motion.how())?;
+    if motion.has_step() {
+        let Motion { dx_m, dy_m, dyaw_rad, .. } = motion;
+        let [sd_x, sd_y, sd_yaw] = [0, 4, 8].map(|at| motion.covariance[at].max(0.0).sqrt());
+        write!(line, ", step ({dx_m:.4}, {dy_m:.4}) m {:.3} deg", dyaw_rad.to_degrees())?;
+        write!(line, " +- ({sd_x:.4}, {sd_y:.4}) m {:.3} deg", sd_yaw.to_degrees())?;
+        if motion.is_degenerate() {
+            write!(line, ", a direction is open")?;
+        }
+    }
+    if motion.has_pose() {
+        let Motion { x_m, y_m, yaw_rad, .. } = motion;
+        write!(line, ", at ({x_m:.3}, {y_m:.3}) m {:.2} deg", yaw_rad.to_degrees())?;
+        if !motion.has_valid_pose() {
+            write!(line, " (not valid)")?;
+        } else if let Some(covariance) = motion.sum_covariance() {
+            let [sd_x, sd_y, sd_yaw] = [0, 4, 8].map(|at| covariance[at].max(0.0).sqrt());
+            write!(line, " +- ({sd_x:.3}, {sd_y:.3}) m {:.2} deg", sd_yaw.to_degrees())?;
+        }
+    }
+    if motion.breaks > 0 { write!(line, ", {} steps refused", motion.breaks) } else { Ok(()) }
+}
+
+pub(crate) fn early(line: &mut Vec<u8>, header: &Header, early: &Early) -> io::Result<()> {
+    numbers(line, header)?;
+    let verdict = early.verdict().name();
+    if early.is_withdrawn() {
+        return write!(line, " {verdict} withdrawn");
+    }
+    let Early { beam, distance_mm, bytes_seen, .. } = early;
+    write!(line, " {verdict} {distance_mm} mm, beam {beam}, after {bytes_seen} bytes")
+}
+
+pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {
+    let Heard { zones, header, .. } = heard;
+    let Some(header) = header else {
+        return write!(line, "unknown: no recent data");
+    };
+    numbers(line, header)?;
+    if heard.stale {
+        return write!(line, " unknown: too old");
+    }
+    write!(line, " {}", zones.verdict().name())?;
+    match zones.nearest() {
+        Some((beam, mm)) => write!(line, " nearest {mm} mm, beam {beam}")?,
+        None => write!(line, " {}", without_nearest(zones.verdict()))?,
+    }
+    for zone in zones.zones() {
+        let violated = if zone.violated != 0 { " violated" } else { "" };
+        write!(line, ", {} mm{violated} {}", zone.radius_mm, zone.beams)?;
+    }
+    if zones.invalid_beams > 0 { write!(line, ", {} invalid", zones.invalid_beams) } else { Ok(()) }
+}
+
+/// The fold over all sensors.
+pub(crate) fn robot(line: &mut Vec<u8>, robot: &Robot) -> io::Result<()> {
+    write!(line, "{}", robot.verdict().name())?;
+    match robot.nearest() {
+        Some((mm, sensor)) => write!(line, " nearest {mm} mm, {sensor}:")?,
+        None => write!(line, " {}:", without_nearest(robot.verdict()))?,
+    }
+    for (sensor, verdict) in robot.sensors() {
+        write!(line, " {sensor} {}", verdict.name())?;
+    }
+    Ok(())
+}
+
+/// In place of what is nearest, where no beam met anything.
+fn without_nearest(verdict: Verdict) -> &'static str {
+    if verdict == Verdict::Unknown { "nearest not known" } else { "nothing near" }
+}
+
+pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
+    for (i, segment) in foreground.segments().iter().enumerate() {
+        let support = if foreground.has_support(i) { "" } else { " without support" };
+        let width_mm = u64::from(segment.width) * u64::from(foreground.unit_um) / 1000;
+        write!(line, ", {width_mm} mm wide at ({}, {}){support}", segment.x_mm, segment.y_mm)?;
+    }
+    Ok(())
+}
+
+pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
+    let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
+    let frozen = if model.is_frozen() { ", frozen" } else { "" };
+    let BackgroundHead { generation, taught, count, unit_um, .. } = **model;
+    let unit_mm = f64::from(unit_um) / 1000.0;
+    write!(
+        line,
+        "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
+    )
+}
+
+pub(crate) fn tracks(line: &mut Vec<u8>, header: &Header, tracks: &Tracks) -> io::Result<()> {
+    numbers(line, header)?;
+    let count = tracks.tracks().len();
+    write!(line, " {count} {}", if count == 1 { "person" } else { "people" })?;
+    for track in tracks.tracks() {
+        let (x_m, y_m, state) = (track.x_m, track.y_m, track.state().name());
+        write!(line, ", {} {state} at ({x_m:.2}, {y_m:.2}) m", track.id)?;
+        if let Some(room) = track.room_name() {
+            write!(line, " in {room}")?;
+        }
+    }
+    Ok(())
+}
+
+pub(crate) fn event(line: &mut Vec<u8>, header: &Header, event: &Event) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " ")?;
+    event_words(line, event)
+}
+
+/// Writes an event as a sentence.
+///
+/// # Errors
+///
+/// Returns the error of the write.
+pub fn event_words(line: &mut Vec<u8>, event: &Event) -> io::Result<()> {
+    let (id, room) = (event.id, event.room_name().unwrap_or("no room"));
+    match (event.kind(), event.door()) {
+        (_, Some((door, from, to))) => write!(line, "{id} went from {from} to {to} through {door}"),
+        (Some(EventKind::Appeared), _) => write!(line, "{id} appeared in {room}"),
+        (Some(EventKind::Left), _) => write!(line, "{id} left, last in {room}"),
+        _ => write!(line, "{id}: event {}", event.kind),
+    }
+}
+
+pub(crate) fn tilt(line: &mut Vec<u8>, header: &Header, tilt: &Tilt) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {:.2} deg", tilt.angle_rad.to_degrees())?;
+    match tilt.rate_rad_s() {
+        Some(rate) => write!(line, ", {:.1} deg/s", rate.to_degrees()),
+        None => Ok(()),
+    }
+}
+
+pub(crate) fn cloud(line: &mut Vec<u8>, header: &Header, cloud: &Cloud) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " sweep {} {} points", cloud.sweep, cloud.points().len())?;
+    let of = |class| cloud.points().iter().filter(|point| point.class() == class).count();
+    let foreground = of(PointClass::Foreground);
+    if foreground > 0 {
+        write!(line, ", {foreground} in the foreground")?;
+    }
+    if cloud.has(Cloud::LAST) {
+        write!(line, ", the last")?;
+    }
+    sweep_words(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::DOUBTED))
+}
+
+/// Writes number and stamp of a sweep, and its obstacles.
+///
+/// # Errors
+///
+/// Returns the error of the write.
+pub fn obstacles(line: &mut Vec<u8>, header: &Header, found: &Obstacles) -> io::Result<()> {
+    numbers(line, header)?;
+    let count = found.obstacles().len();
+    write!(line, " sweep {} {count} {}", found.sweep, if count == 1 { "obstacle" } else { "obstacles" })?;
+    for one in found.obstacles() {
+        let ([x_m, y_m, _], [bottom, top]) = (one.middle, [one.low[2], one.high[2]]);
+        write!(line, ", at ({x_m:.2}, {y_m:.2}) m from {bottom:.2} to {top:.2} m above the floor")?;
+        if one.has(Obstacle::NEAR) {
+            write!(line, " too near")?;
+        }
+    }
+    if found.left_out > 0 {
+        write!(line, ", {} left out", found.left_out)?;
+    }
+    sweep_words(line, found.has(Obstacles::COMPLETE), found.has(Obstacles::DOUBTED))
+}
+
+fn sweep_words(line: &mut Vec<u8>, is_complete: bool, is_doubted: bool) -> io::Result<()> {
+    if !is_complete {
+        write!(line, ", incomplete")?;
+    }
+    if is_doubted { write!(line, ", doubted") } else { Ok(()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use scanhub_schema::Zones;
+
+    #[test]
+    fn what_is_not_known_is_not_called_far() {
+        let text = |verdict: Verdict| {
+            let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
+            let mut line = Vec::new();
+            let header = Some(Header::default());
+            super::zones(&mut line, &Heard { zones, header, missed: 0, stale: false, said: zones }).unwrap();
+            String::from_utf8(line).unwrap()
+        };
+        assert!(text(Verdict::Clear).ends_with(" clear nothing near"));
+        assert!(text(Verdict::Unknown).ends_with(" unknown nearest not known"));
+        let mut line = Vec::new();
+        robot(&mut line, &Robot::default()).unwrap();
+        assert_eq!(line, b"unknown nearest not known:");
+    }
+
+    #[test]
+    fn a_segment_without_support_says_so() {
+        let mut found = Foreground::of(3);
+        let head = scanhub_schema::ForegroundHead {
+            unit_um: 10_000,
+            count: 3,
+            beams: 3,
+            segments: 2,
+            supported: 1,
+            ..scanhub_schema::ForegroundHead::default()
+        };
+        let segments = found.begin(head).segments;
+        segments[0] =
+            scanhub_schema::Segment { first: 0, last: 1, width: 7, x_mm: 900, y_mm: -4, ..segments[0] };
+        segments[1] = scanhub_schema::Segment { first: 2, last: 2, x_mm: 8, ..segments[1] };
+        let mut line = Vec::new();
+        foreground(&mut line, &Header::default(), &found).unwrap();
+        let line = String::from_utf8(line).unwrap();
+        assert!(
+            line.ends_with(
+                " 3 beams, 2 segments, 70 mm wide at (900, -4), 0 mm wide at (8, 0) without support"
+            )
+        );
+        let json =
+            serde_json::to_value(crate::json::foreground("front", &Header::default(), &found)).unwrap();
+        let supports: Vec<_> =
+            json["segments"].as_array().unwrap().iter().map(|segment| &segment["support"]).collect();
+        assert_eq!(supports, [true, false]);
+    }
 }

@@ -4,7 +4,7 @@ use std::num::NonZeroU64;
 
 use scanhub_schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
 
-use scanhub_verbs::selection::Word;
+use scanhub_verbs::names::Word;
 
 /// The topics that go out.
 #[derive(Clone, Debug)]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Kind};
 
-use scanhub_verbs::background_task::BackgroundTask;
+use scanhub_verbs::discovery::BackgroundTask;
 
 /// A host and port.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! Selection of the gateways and topics that a receiver takes, and the names that the user gave to gateways.
 
 use scanhub_schema::{Failure, Kind, Topic, check_sensor};
-use scanhub_verbs::selection::Word;
+use scanhub_verbs::names::Word;
 
 /// Names that the user gave to gateways.
 #[derive(Default)]
