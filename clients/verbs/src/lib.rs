@@ -1,6 +1,5 @@
-//! The verbs that follow a hub and show, record or forward what it publishes: everything that prints. Each uses
-//! `scanhub_client`, never the hub itself. Refuses to know command lines and signals: options are structs, the request
-//! to stop is a flag.
+//! Prints and records the topics of a hub: each verb is one file with its arguments, its run and its output. [`follow`] is the
+//! loop that they share. A verb uses `scanhub_client`, never the hub itself, and takes the request to stop as a flag.
 
 mod background;
 mod control;
@@ -37,6 +36,3 @@ pub use list::ListArgs;
 #[cfg(feature = "record")]
 pub use record::RecordArgs;
 pub use zones::ZonesArgs;
-
-#[cfg(feature = "record")]
-use names as selection;

@@ -40,10 +40,10 @@ use self::queue::{Entry, Gap, News, Queue, WriterProgress};
 use self::report::{Look, Report};
 use crate::follow::{Bounds, Event, Following};
 use crate::lossy_writer::LossyWriter;
+use crate::names::Selection;
 use crate::names::TopicName;
 use crate::output::{End, quiet};
 use crate::receive_stats::ReceiveStats;
-use crate::selection::Selection;
 
 /// Arguments of `record`.
 #[derive(Args, Clone, Debug)]
