@@ -69,7 +69,7 @@ impl LatencyArgs {
     /// # Errors
     ///
     /// - [`Kind::Check`] if a topic is older than `--max-p99` permits, or its age is unknown.
-    /// - The errors of [`echo`](crate::echo()).
+    /// - The errors of [`echo`](crate::EchoArgs::run).
     pub fn run(
         &self,
         json: bool,

@@ -59,7 +59,7 @@ impl LedsArgs {
     ///
     /// - [`Kind::Configuration`] if an LED does not exist or its light is unknown.
     /// - [`Kind::Failed`] if an LED may not be switched.
-    /// - The errors of [`echo`](crate::echo()).
+    /// - The errors of [`echo`](crate::EchoArgs::run).
     pub fn run(
         &self,
         json: bool,

@@ -116,7 +116,7 @@ impl RecordArgs {
     /// - [`Kind::Usage`] if the topics or stdout cannot be recorded.
     /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::Short`] if either
     ///   is for lack of space.
-    /// - The errors of [`echo`](crate::echo()).
+    /// - The errors of [`echo`](crate::EchoArgs::run).
     pub fn run(
         &self,
         json: bool,

@@ -1,5 +1,5 @@
 //! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what
-//! it reports of itself. Changes no settings. [`SuggestedLink`] is the link that a configuration needs for the scanner, as
+//! it reports of itself. Changes no settings. `SuggestedLink` is the link that a configuration needs for the scanner, as
 //! a command for the shell and as a section of a file.
 
 mod description;

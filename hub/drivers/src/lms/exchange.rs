@@ -1,5 +1,5 @@
 //! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration
-//! use [`Exchange`]. A session only uses [`Outgoing`], the request that is being sent, or whose reply is expected.
+//! use [`Exchange`]. A session only uses `Outgoing`, the request that is being sent, or whose reply is expected.
 //!
 //! The scanner requires at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates
 //! (Telegram listing 4.3). So a request is sent byte by byte.
