@@ -84,7 +84,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         }
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::Telegram(telegram) => telegram.run(json, &mut out),
-        Verb::Probe(probe) => probe.run(json, &everywhere.places()?, &mut out, &*interrupt()?),
+        Verb::Probe(probe) => probe.run(json, || everywhere.places(), &mut out, &*interrupt()?),
         Verb::Configure(configure) => {
             configure.run(json, &everywhere.places()?, &mut out, &*interrupt_by(&ENDS)?)
         }
@@ -101,7 +101,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             args.run(&run.sources(), domains, json, &mut out, &*interrupt()?)
         }
         Verb::List(list) => {
-            list.run(json, &everywhere.domain, everywhere.root.as_deref(), &mut out, &*interrupt()?)
+            list.run(json, &everywhere.domain, everywhere.root.as_deref(), &mut out, interrupt)
         }
         Verb::Info(info) => info.run(json, &everywhere.places()?, &mut out, &*interrupt()?),
         Verb::Echo(echo) => echo.run(json, &everywhere.places()?, &mut out, &mut notes, &*interrupt()?),

@@ -37,6 +37,8 @@ fn show(
     out: &mut dyn Write,
     stop: &Arc<AtomicBool>,
 ) -> Result<(), Failure> {
+    everywhere.places()?;
+    web.check()?;
     let domain = OwnDomain::new("web")?;
     let sources = Sources { files: Sources::system(), ..Sources::default() };
     let replay = scanhub_daemon::Replay {

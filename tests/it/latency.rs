@@ -82,7 +82,10 @@ fn ages_of_a_stream_are_split_and_judged() {
     assert!(number(&told(&outcome), "before") <= 1, "the one that is kept for late joiners");
     let text = env.run(&["latency", "front/scan", "-n", "5"]);
     let out = String::from_utf8_lossy(&text.out).into_owned();
-    assert!(out.contains("p99.9") && out.contains("\nwake ") && !out.contains(" ##"), "{text}");
+    // On a busy machine, all of them may have waited for the subscriber.
+    let are_left_out = out.contains("5 were sent before this listened");
+    assert!(are_left_out || out.contains("p99.9") && out.contains("\nwake "), "{text}");
+    assert!(!out.contains(" ##"), "{text}");
     assert!(text.errors.contains("wait by doorbell") && text.errors.contains("ns to read"), "{text}");
     assert_eq!(env.run(&["latency"]).code, Some(2));
     assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));

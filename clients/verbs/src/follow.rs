@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Follower, GRACE, Sample, Session, Source, Who};
-use scanhub_client::{Received, Wait, clock};
+use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Kind, Status, Topic, is_remote};
 use scanhub_shm::Domain;
 
@@ -39,6 +39,10 @@ impl Bounds {
 }
 
 /// What arrives while a verb follows topics.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "nearly every event is a sample, which a box would only slow down"
+)]
 pub enum Event {
     /// The run follows this topic from now on.
     Begun(Rc<TopicName>),
@@ -52,7 +56,7 @@ pub enum Event {
     /// ([`Following::despite_shortage`]).
     Short(Rc<TopicName>, Failure),
     /// A status of a sensor ([`Following::with_lines`]).
-    Line(String, Received<Status>),
+    Line(String, Box<Status>),
     /// Comes after each round of samples, and about ten times a second if there are none.
     Tick(Instant),
 }
@@ -261,6 +265,11 @@ impl<'a> Following<'a> {
         }
     }
 
+    /// Returns whether the run has received all samples that waited before the last [`Event::Tick`].
+    pub fn is_caught_up(&self) -> bool {
+        !self.round.more
+    }
+
     /// Waits for the next event, and returns it; `None` after the last one. At `wake_at` there is a [`Event::Tick`], whatever comes.
     ///
     /// # Errors
@@ -459,7 +468,8 @@ impl<'a> Following<'a> {
                     Ok(None) => break,
                     Ok(Some(status)) => {
                         line.note(status.header().boot, &status.counters);
-                        self.events.push_back(Event::Line(sensor.clone(), status));
+                        // A copy: the hub lends four samples of a topic at most.
+                        self.events.push_back(Event::Line(sensor.clone(), Box::new(*status)));
                     }
                     Err(_) => *source = None,
                 }

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
@@ -32,19 +33,19 @@ impl ListArgs {
     /// # Errors
     ///
     /// - [`Kind::NoHub`](scanhub_schema::Kind) within a second if no hub runs.
-    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if `stop` is set.
-    /// - The errors of [`Domain::candidates`], and that of a write to `out`.
+    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if the flag of `interrupt` is set.
+    /// - The errors of [`Domain::candidates`] and of `interrupt`, and that of a write to `out`.
     pub fn run(
         &self,
         json: bool,
         domain: &str,
         root: Option<&Path>,
         out: &mut dyn Write,
-        stop: &AtomicBool,
+        interrupt: impl FnOnce() -> Result<Arc<AtomicBool>, Failure>,
     ) -> Result<(), Failure> {
         let environment = Environment::of_process();
         match (self.domains, root) {
-            (false, _) => topics(json, &Domain::candidates(domain, root, &environment)?, out, stop),
+            (false, _) => topics(json, &Domain::candidates(domain, root, &environment)?, out, &*interrupt()?),
             (true, Some(root)) => domains(json, &[root.to_owned()], &[], out),
             (true, None) => domains(json, &environment.bases(), &RunningHub::all(Path::new("/")), out),
         }

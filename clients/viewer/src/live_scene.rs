@@ -144,9 +144,13 @@ impl LiveScene {
 
     /// Deletes data that is too old. Returns whether there was any.
     pub(crate) fn age(&mut self) -> bool {
+        self.scene.age(clock::now_ns())
+    }
+
+    /// Drops samples whose partners do not come. Call it when all samples that have arrived were taken.
+    pub(crate) fn expire_joins(&mut self) {
         let now_ns = clock::now_ns();
         self.joins.values_mut().for_each(|join| join.expire(now_ns));
-        self.scene.age(now_ns)
     }
 
     /// Updates the CPU time of the hub. Returns whether it has changed.

@@ -219,7 +219,12 @@ impl Watcher<'_> {
                 Event::Short(name, Failure { message, hint, .. }) => {
                     self.say(format!("{name} is not shown: {message}; {hint}"), Instant::now());
                 }
-                Event::Tick(now) => self.tick(now)?,
+                Event::Tick(now) => {
+                    if following.is_caught_up() {
+                        self.live.expire_joins();
+                    }
+                    self.tick(now)?;
+                }
                 Event::Subscribed(_) | Event::Line(..) => {}
             }
         }

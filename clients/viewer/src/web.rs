@@ -78,6 +78,22 @@ const MAX_TOKEN_FILE: u64 = 4096;
 const REPORT_INTERVAL: Duration = Duration::from_secs(10);
 
 impl WebArgs {
+    /// Checks what can be checked before a recording is opened.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Input`] or [`Kind::Configuration`] if the token cannot be read from its file.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.token().map(drop)
+    }
+
+    fn token(&self) -> Result<Option<String>, Failure> {
+        match &self.token_file {
+            Some(file) => read_token(file).map(Some),
+            None => Ok(self.token.clone()),
+        }
+    }
+
     /// Serves the sensors of the first live domain of `places`, until the limits are reached or `stop` is set. Prints
     /// the URLs, and each viewer that connects or disconnects, to `out`. Viewers control the `player`, if there is one.
     ///
@@ -95,10 +111,7 @@ impl WebArgs {
         out: &mut dyn Write,
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
-        let token = match &self.token_file {
-            Some(file) => Some(read_token(file)?),
-            None => self.token.clone(),
-        };
+        let token = self.token()?;
         self.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
         if !self.listen.ip().is_loopback() && token.is_none() && !self.open {
             let what = format!("other machines could watch at {}", self.listen);

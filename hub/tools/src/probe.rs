@@ -38,8 +38,8 @@ pub struct ProbeArgs {
 }
 
 impl ProbeArgs {
-    /// Prints the scanner at the port, or the ports of this machine without opening any. `places` are the locations in which
-    /// a client would search for the domain of a hub.
+    /// Prints the scanner at the port, or the ports of this machine without opening any. `places` returns the locations in
+    /// which a client would search for the domain of a hub.
     ///
     /// # Errors
     ///
@@ -49,14 +49,15 @@ impl ProbeArgs {
     pub fn run(
         &self,
         json: bool,
-        places: &[Domain],
+        places: impl FnOnce() -> Result<Vec<Domain>, Failure>,
         out: &mut dyn Write,
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
         let Some(port) = &self.port else { return list_ports(json, out) };
+        let places = places()?;
         let mut progress = Progress::on_stderr();
         let found =
-            probe(&source(port)?, places, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+            probe(&source(port)?, &places, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
         if found.is_err() {
             progress.leave();
         }

@@ -67,7 +67,11 @@ impl<P: Payload + ?Sized> Port<P> {
 
     /// Waits until `count` consumers are there.
     pub(crate) fn await_subscribers(&self, count: usize) {
-        until("subscribers", || self.service.dynamic_config().number_of_subscribers() == count);
+        until("subscribers", || self.subscribers() == count);
+    }
+
+    pub(crate) fn subscribers(&self) -> usize {
+        self.service.dynamic_config().number_of_subscribers()
     }
 }
 

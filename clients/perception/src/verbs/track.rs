@@ -143,7 +143,13 @@ impl TrackRun<'_> {
                 follow::Event::Subscribed(_) => self.is_subscribed = true,
                 follow::Event::Sample(name, sample, _) => self.sample(&name, &sample)?,
                 follow::Event::Notice(names, notice) => self.writer.results.notice(&names, &notice)?,
-                follow::Event::Tick(now) => self.tick(now)?,
+                follow::Event::Tick(now) => {
+                    if following.is_caught_up() {
+                        let now_ns = clock::now_ns();
+                        self.joins.iter_mut().for_each(|join| join.expire(now_ns));
+                    }
+                    self.tick(now)?;
+                }
                 _ => {}
             }
         }
@@ -152,8 +158,6 @@ impl TrackRun<'_> {
 
     /// Reports late scans, and publishes as soon as a domain exists.
     fn tick(&mut self, now: Instant) -> Result<(), End> {
-        let now_ns = clock::now_ns();
-        self.joins.iter_mut().for_each(|join| join.expire(now_ns));
         for (sensor, count) in self.late.due(now, self.tracker.late()) {
             self.writer.report_late(sensor, count, self.args.delay)?;
         }

@@ -5,7 +5,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
-use scanhub_schema::{Counter, Flags, Kind, Verdict};
+use scanhub_schema::{Counter, Flags, Kind, Topic, Verdict};
+use scanhub_verbs::follow::{Event, Following};
+use scanhub_verbs::names::TopicName;
 use scanhub_verbs::{Bounds, EchoArgs};
 
 const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
@@ -329,4 +331,29 @@ fn what_the_line_took_away_meanwhile_is_in_the_summary() {
     );
     assert!(summary.ends_with(r#""damaged":0.25,"lost_on_line":80}"#), "{out}");
     assert!(!out.contains(r#""class":"status""#), "{out}");
+}
+
+/// A hub lends four statuses at most, and that number may have waited.
+#[test]
+fn statuses_that_waited_do_not_hide_later_ones() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let names = [TopicName { sensor: "front".to_owned(), topic: Topic::Scan }];
+    let (places, bounds, stop) = (place.places(), Bounds::default(), AtomicBool::new(false));
+    let mut following = Following::new(&names, &[], &places, &bounds, &stop).with_lines();
+    // Takes events until the status with this count arrives, or for 0 until the topic has a subscriber.
+    let mut follow = |hub: &mut FakeHub, errors: u64| loop {
+        match following.next(None).unwrap().expect("the run has no end") {
+            Event::Line(_, status) if status.counters[Counter::LineErrors] == errors => break,
+            Event::Tick(_) if errors == 0 && hub.front().status.subscribers() == 1 => break,
+            _ => {}
+        }
+    };
+    follow(&mut hub, 0);
+    for errors in 1..=4 {
+        hub.front().status(|status| status.counters[Counter::LineErrors] = errors);
+    }
+    follow(&mut hub, 4);
+    hub.front().status(|status| status.counters[Counter::LineErrors] = 5);
+    follow(&mut hub, 5);
 }

@@ -1,5 +1,6 @@
 //! `list`, `info` and `hz` with a hub and without one.
 
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
@@ -10,7 +11,8 @@ use scanhub_verbs::{Bounds, HzArgs, InfoArgs, ListArgs};
 
 fn start_list(place: &Place, json: bool) -> Verb {
     let (domain, base) = (place.domain.name().to_owned(), place.base.clone());
-    Verb::start(move |out, _, stop| ListArgs { domains: false }.run(json, &domain, Some(&base), out, stop))
+    let interrupt = || Ok(Arc::new(AtomicBool::new(false)));
+    Verb::start(move |out, _, _| ListArgs { domains: false }.run(json, &domain, Some(&base), out, interrupt))
 }
 
 fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
@@ -66,7 +68,8 @@ fn live_domains() {
     let list = || {
         let mut out = Vec::new();
         let args = ListArgs { domains: true };
-        args.run(true, DEFAULT_DOMAIN, Some(&place.base), &mut out, &AtomicBool::new(false)).unwrap();
+        let interrupt = || Ok(Arc::new(AtomicBool::new(false)));
+        args.run(true, DEFAULT_DOMAIN, Some(&place.base), &mut out, interrupt).unwrap();
         String::from_utf8(out).unwrap()
     };
     assert_eq!(list(), "");

@@ -128,7 +128,12 @@ impl Feed<'_> {
                 Event::Notice(names, notice) => self.notice(&names, &notice)?,
                 // The topics that are followed already stay.
                 Event::Short(name, failure) => self.reporter.not_served(&name, &failure)?,
-                Event::Tick(now) => self.tick(now)?,
+                Event::Tick(now) => {
+                    if following.is_caught_up() {
+                        self.live.expire_joins();
+                    }
+                    self.tick(now)?;
+                }
                 Event::Subscribed(_) | Event::Line(..) => {}
             }
         }
