@@ -90,6 +90,8 @@ fn what_waited_for_a_listener_that_was_stopped_is_not_new() {
         // Sends to a listener that is stopped for a while; its stamp, and when it was sent.
         let mut stop = || {
             listener.signal(Signal::STOP);
+            // Otherwise, a listener that still runs receives the datagram at once.
+            until("the listener is stopped", || listener.is_stopped());
             let before = now();
             sender.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             let after = now();
