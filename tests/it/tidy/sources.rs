@@ -7,6 +7,18 @@ fn is_test(path: &str) -> bool {
     path.starts_with("tests/") || path.starts_with("benches/") || path.contains("/tests/")
 }
 
+/// Finds clocks in the program. Clippy holds this for the crates below `hub/` and `schema/`, but the program has the folder of all
+/// crates, also of those that may read a clock.
+pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &Tree) -> Vec<String> {
+    find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
+        let in_hub = path.strip_prefix("hub/");
+        let is_program = in_hub.is_some_and(|file| {
+            !file.contains('/') || file.starts_with("cli/") || file.starts_with("replay/")
+        });
+        is_program && path != "hub/demo.rs"
+    })
+}
+
 /// Files that may hold unsafe code, each for something that no safe crate offers.
 const UNSAFE: [&str; 8] = [
     // A page that hub and consumers map.

@@ -3,6 +3,16 @@
 use super::{holds, sources, written};
 
 #[test]
+fn only_the_demonstration_of_the_program_reads_clocks() {
+    holds(sources::only_the_demonstration_of_the_program_reads_clocks, |tree| {
+        vec![
+            tree.with("hub/main.rs", "//! The program.\nlet now = std::time::Instant::now();\n"),
+            tree.with("hub/cli/convert.rs", "//! Conversion.\nlet now = SystemTime::now();\n"),
+        ]
+    });
+}
+
+#[test]
 fn tests_do_not_depend_on_time() {
     holds(sources::tests_do_not_depend_on_time, |tree| {
         vec![
