@@ -113,11 +113,11 @@ impl Discovery {
 #[derive(Debug)]
 pub struct BackgroundTask<T>(Receiver<T>);
 
-/// Interval at which a waiting caller checks whether it shall stop.
+/// Interval at which a waiting caller checks whether it must stop.
 const STOP_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 impl<T: Send + 'static> BackgroundTask<T> {
-    /// Begins it; nothing if there is no thread to be had: then it is to be tried again.
+    /// Starts the work. Returns `None` if the system has no thread; try again later.
     pub fn begin(work: impl FnOnce() -> T + Send + 'static) -> Option<BackgroundTask<T>> {
         let (done, result) = channel();
         let thread = thread::Builder::new().name("errand".into()).spawn(move || {
@@ -126,12 +126,12 @@ impl<T: Send + 'static> BackgroundTask<T> {
         thread.ok().map(|_| BackgroundTask(result))
     }
 
-    /// Its result, once, as soon as there is one.
+    /// Returns the result once, after the work has ended.
     pub fn result(&self) -> Option<T> {
         self.0.try_recv().ok()
     }
 
-    /// Its result, waited for; nothing if `stop` is set before there is one.
+    /// Waits for the result, and returns it. Returns `None` if `stop` is set before.
     pub fn wait(&self, stop: &AtomicBool) -> Option<T> {
         while !stop.load(Ordering::Relaxed) {
             match self.0.recv_timeout(STOP_CHECK_INTERVAL) {

@@ -38,7 +38,7 @@ impl Bounds {
     }
 }
 
-/// What arrives while a verb follows topics.
+/// An event of a run that follows topics.
 #[expect(
     clippy::large_enum_variant,
     reason = "nearly every event is a sample, which a box would only slow down"
@@ -61,7 +61,7 @@ pub enum Event {
     Tick(Instant),
 }
 
-/// When this process received a sample.
+/// Time at which this process received a sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Arrival {
     /// CLOCK_MONOTONIC, in ns.
@@ -70,24 +70,24 @@ pub struct Arrival {
     pub wall_ns: u64,
 }
 
-/// What went wrong in a stream, beside its samples.
+/// A problem of a stream, or its end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Notice {
-    /// So many samples were sent and not received.
+    /// Number of samples that were sent and not received.
     Missed(u64),
-    /// Nothing came for longer than the topic's samples are apart.
+    /// The topic has been silent for longer than its samples are apart.
     Stale,
     /// No hub runs in the domain when the verb starts, so the verb waits for one. The failure names the places that were
     /// searched, and the hubs of other users.
     NoHub(Failure),
     /// The hub of the domain has ended.
     HubGone,
-    /// A hub lives in the domain again.
+    /// A hub runs in the domain again.
     HubBack,
 }
 
 impl Notice {
-    /// Tells it of `names`, or of the domain if there are none: lines of JSON to `out`, or text to `notes`.
+    /// Writes the notice for `names`, or for the domain if `names` is empty: lines of JSON to `out`, or text to `notes`.
     pub fn tell(
         &self,
         names: &[Rc<TopicName>],
@@ -102,18 +102,19 @@ impl Notice {
     }
 }
 
-/// The topics that a verb follows, in the first of several domains where a hub lives.
+/// The topics that a verb follows, in the first of several domains in which a hub runs.
 pub struct Following<'a> {
     session: Session,
     topics: Vec<Followed>,
-    /// The statuses of the followed sensors, if they are wanted, and for how many of `topics` they are followed.
+    /// The lines of the followed sensors, for a run with lines.
     lines: Option<Vec<FollowedLine>>,
+    /// Number of `topics` whose lines are followed.
     topics_with_line: usize,
     /// Which topics of each sensor of the hub the run follows.
     of_all_sensors: &'a [Topic],
     unwanted: Vec<Topic>,
     discovery: Discovery,
-    /// Whether samples come before news of the hub.
+    /// Whether the run receives samples before it looks for the hub.
     closely: bool,
     despite_shortage: bool,
     bounds: &'a Bounds,
@@ -121,22 +122,22 @@ pub struct Following<'a> {
     stage: Stage,
     round: Round,
     events: VecDeque<Event>,
-    /// How the run ended. The events before that come first.
+    /// Result of a run that has ended. `next` returns it after all `events`.
     end: Option<Result<(), End>>,
     started: Instant,
     last_sample: Instant,
     hub_seen: Option<Instant>,
-    /// Since when a hub lives, and not only a listener, as far as the run looked.
+    /// Time at which the run first saw a hub, and not only a listener.
     hub_lives_since: Option<Instant>,
     /// When the run looked last which sensors there are.
     asked_at: Option<Instant>,
     waiting_said: bool,
     received: u64,
-    /// Until when the run subscribes to nothing, because memory, descriptors or places are short.
+    /// End of the pause in which the run subscribes to no topic, because memory, descriptors or places are short.
     short_until: Option<Instant>,
 }
 
-/// What the run does next.
+/// The next step of a run.
 #[derive(Clone, Copy, PartialEq)]
 enum Stage {
     Start,
@@ -147,12 +148,12 @@ enum Stage {
     Wait,
 }
 
-/// How far a round over all topics is.
+/// Progress of a round over all topics.
 #[derive(Default)]
 struct Round {
     /// The topic that has its turn.
     topic: usize,
-    /// How many samples it gave.
+    /// Number of samples that it gave.
     taken: usize,
     /// The round has subscribed to a topic.
     subscribed: bool,
@@ -176,8 +177,7 @@ struct Followed {
     since_ns: u64,
 }
 
-/// The serial line of a sensor. Its statuses are no samples of the run: no bound counts them, and the run does not fail without
-/// them.
+/// The serial line of a sensor. Bounds do not count its statuses, and the run does not fail without them.
 struct FollowedLine {
     sensor: String,
     /// `None` if its statuses cannot be received.
@@ -187,11 +187,11 @@ struct FollowedLine {
 
 /// Samples taken from one topic before the next one has its turn.
 const TURN: usize = 32;
-/// The listener has announced the sensors of other machines after so long: it announces them once a second.
+/// Time in which a listener announces the sensors of other machines. It announces them once a second.
 const ANNOUNCED: Duration = Duration::from_secs(3);
-/// How often the run looks which sensors there are while one is missing. A look takes milliseconds, in which samples wait.
+/// Interval at which the run lists the sensors while one is missing. A look takes milliseconds, in which samples wait.
 const ASK_EVERY: Duration = Duration::from_millis(500);
-/// How long the run subscribes to nothing after a shortage: a try takes as long as receiving a thousand samples.
+/// Pause after a shortage, in which the run subscribes to no topic: a try takes as long as receiving a thousand samples.
 const SHORTAGE_PAUSE: Duration = Duration::from_secs(1);
 
 impl<'a> Following<'a> {
@@ -274,7 +274,7 @@ impl<'a> Following<'a> {
     ///
     /// # Errors
     ///
-    /// [`Kind::NoTopic`] with the names of the sensors; [`Kind::NoHub`] if the run is bounded and no hub lives at its start;
+    /// [`Kind::NoTopic`] with the names of the sensors; [`Kind::NoHub`] if the run is bounded and no hub runs at its start;
     /// [`Kind::Timeout`]; [`Kind::Interrupted`] if it is bounded and was stopped before; [`Kind::Short`].
     pub fn next(&mut self, wake_at: Option<Instant>) -> Result<Option<Event>, End> {
         loop {
@@ -543,7 +543,7 @@ impl<'a> Following<'a> {
         if !topics.is_empty() && !topics.iter().any(is_missing) {
             return Ok(());
         }
-        // A process without a descriptor to follow a topic has none to ask for it.
+        // A list of the sensors needs a descriptor, too.
         if self.session.domain().is_none() || self.is_short() {
             return Ok(());
         }

@@ -103,7 +103,7 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
 }
 
-/// What one word stands for.
+/// Sensor and topic that one word selects.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Word {
     /// The sensor; nothing: all of them.
@@ -145,7 +145,7 @@ impl Word {
     }
 }
 
-/// What several words stand for together.
+/// The topics that several words select together.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Selection {
     /// Topics of sensors that are named, each once, in the order of the words.

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_schema::{Counter, Counters, Pace, Topic};
 
-/// The account of one topic in one run.
+/// Counts of one topic in one run.
 #[derive(Clone, Debug)]
 pub struct ReceiveStats {
     topic: Topic,
@@ -12,9 +12,9 @@ pub struct ReceiveStats {
     pub(crate) received: u64,
     /// Samples sent meanwhile and not received: missing numbers.
     pub(crate) lost: u64,
-    /// Samples received as they were sent, and when the first of them came.
+    /// Number of samples received as they were sent, and the time of the first of them.
     live: Option<(u64, Instant)>,
-    /// What the sensor's line took away in the run, where that was watched.
+    /// Losses on the sensor's line in the run, if its statuses are followed.
     pub(crate) loss: Loss,
     first: Option<Instant>,
     last: Option<Instant>,
@@ -23,7 +23,7 @@ pub struct ReceiveStats {
 }
 
 impl ReceiveStats {
-    /// Nothing received yet.
+    /// Makes the counts of a topic without samples.
     pub(crate) fn new(topic: Topic) -> ReceiveStats {
         ReceiveStats {
             topic,
@@ -91,13 +91,13 @@ impl ReceiveStats {
 /// Losses on the line of a sensor in one run, from the counters of its statuses. They start at 0 when the hub restarts.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Line {
-    /// Life of the hub, its counters when the run met it, and the last ones.
+    /// The hub's `boot`, its counters when the run first received them, and the last ones.
     life: Option<(u64, Counters, Counters)>,
-    /// What lives before that one came to.
+    /// Sums of the hubs before that one.
     past: Sums,
 }
 
-/// What the line took away in a run; nothing where that is not known.
+/// Losses on a line in a run; `None` if they are not known.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Loss {
     /// Share of the bytes that were in nothing, 0 to 1.
@@ -115,20 +115,20 @@ struct Sums {
 }
 
 impl Line {
-    /// A status with `counters` came, of the hub's life `boot`.
+    /// Takes the counters of a status from the hub with this `boot`.
     pub(crate) fn note(&mut self, boot: u64, counters: &Counters) {
         match &mut self.life {
             Some((life, _, last)) if *life == boot => *last = *counters,
             Some(_) => {
                 self.past = self.sums();
-                // A hub that came while the run went on: all that it counted is of the run.
+                // The hub started during the run, so all its counts belong to the run.
                 self.life = Some((boot, Counters::default(), *counters));
             }
             None => self.life = Some((boot, *counters, *counters)),
         }
     }
 
-    /// What it took away since the first status.
+    /// Returns the losses since the first status.
     pub(crate) fn loss(&self) -> Loss {
         let Sums { read, damaged, lost, is_known } = self.sums();
         let damaged = (read > 0).then(|| (damaged as f64 / read as f64).min(1.0));

@@ -40,8 +40,7 @@ use self::queue::{Entry, Gap, News, Queue, WriterProgress};
 use self::report::{Look, Report};
 use crate::follow::{Bounds, Event, Following};
 use crate::lossy_writer::LossyWriter;
-use crate::names::Selection;
-use crate::names::TopicName;
+use crate::names::{Selection, TopicName};
 use crate::output::{End, quiet};
 use crate::receive_stats::ReceiveStats;
 
