@@ -139,11 +139,23 @@ pub(crate) struct Rhythm {
     first: Option<Nanos>,
     /// Minimum number of reads per telegram.
     pieces: u8,
+    /// How long before the expected end of a telegram the host reads again.
+    lead: Nanos,
+    /// Reads since the sleep that ended shortly before the end of the telegram. `None` before that sleep.
+    reads_near_end: Option<u32>,
 }
 
 impl Rhythm {
     pub(crate) fn new() -> Self {
-        Rhythm { duration: None, least: Nanos::MAX, counted: 0, first: None, pieces: 1 }
+        Rhythm {
+            duration: None,
+            least: Nanos::MAX,
+            counted: 0,
+            first: None,
+            pieces: 1,
+            lead: MAX_LEAD,
+            reads_near_end: None,
+        }
     }
 
     /// Sets the number of reads per telegram, at equal distances; 0 is 1.
@@ -156,23 +168,35 @@ impl Rhythm {
         self.first = Some(first);
     }
 
+    /// Handles a read that returned bytes.
+    pub(crate) fn note_read(&mut self) {
+        if let Some(reads) = &mut self.reads_near_end {
+            *reads += 1;
+        }
+    }
+
     /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for
     /// each.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
-        let end = first + duration.checked_sub(LEAD)?;
+        let end = first + duration.checked_sub(self.lead)?;
         let soon = now + MIN_REST;
         let pieces = Nanos::from(self.pieces);
         let piece = (1..pieces).map(|n| first + n * duration / pieces);
         let piece = piece.take_while(|&at| at + MIN_REST < end).find(|&at| at > soon);
         self.first = self.first.filter(|_| piece.is_some());
         let until = piece.unwrap_or(end);
-        (until > soon).then_some(until)
+        let is_worth_it = until > soon;
+        if piece.is_none() && is_worth_it {
+            self.reads_near_end = Some(0);
+        }
+        is_worth_it.then_some(until)
     }
 
     /// Handles a complete telegram with the given duration from its first to its last byte.
     pub(crate) fn complete(&mut self, took: Nanos) {
         self.first = None;
+        self.adapt_lead();
         self.least = self.least.min(took);
         self.counted += 1;
         if self.counted >= if self.duration.is_none() { LESSONS } else { WINDOW } {
@@ -182,9 +206,21 @@ impl Rhythm {
         }
     }
 
+    /// Adapts the lead to the lateness of sleeps and the chunks of the line. With the right lead, the sleep ends before
+    /// the last chunk of the telegram and after the one before it, so that the host waits once.
+    fn adapt_lead(&mut self) {
+        match self.reads_near_end.take() {
+            // The telegram was complete before the sleep ended.
+            Some(1) => self.lead = (self.lead + LEAD_RISE).min(MAX_LEAD),
+            Some(3..) => self.lead = (self.lead - LEAD_FALL).max(MIN_LEAD),
+            _ => {}
+        }
+    }
+
     /// Discards the arrival of the first byte.
     pub(crate) fn lose(&mut self) {
         self.first = None;
+        self.reads_near_end = None;
     }
 
     /// Returns whether the duration `took` is unusually long.
@@ -201,8 +237,16 @@ const LATE: Nanos = 50 * MILLIS;
 /// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and
 /// longer than the kernel needs to move bytes from one buffer to the next.
 const CALM: Nanos = 12 * MILLIS;
-/// The host reads this time before the expected end: one or two chunks of 16 bytes.
-const LEAD: Nanos = 600 * MICROS;
+/// Maximum time before the expected end at which the host reads again, with which it starts: one or two chunks of 16
+/// bytes.
+const MAX_LEAD: Nanos = 600 * MICROS;
+/// Minimum of the same. The sleeps of an idle host are late by 50 to 100 us.
+const MIN_LEAD: Nanos = 100 * MICROS;
+/// The lead becomes longer by this if a sleep ended too late.
+const LEAD_RISE: Nanos = 80 * MICROS;
+/// The lead becomes shorter by this if the host had to wait twice. It is a fraction of [`LEAD_RISE`], so that few
+/// telegrams are late.
+const LEAD_FALL: Nanos = 5 * MICROS;
 /// Minimum sleep. A shorter one is not worth the system call.
 const MIN_REST: Nanos = 500 * MICROS;
 /// Number of telegrams before the first sleep.
@@ -319,6 +363,46 @@ mod tests {
         }
         rhythm.begin(200_000_000);
         assert_eq!(rhythm.rest(200_000_000), Some(216_900_000));
+    }
+
+    /// Plays 400 telegrams of 18 ms that arrive in chunks of `chunk`, to a host whose sleeps are late by up to `lateness`.
+    /// Returns the average number of reads after the sleep in the last 200 of them, and how many were complete before
+    /// it ended.
+    fn play(chunk: Nanos, lateness: Nanos) -> (f64, u32) {
+        const DURATION: Nanos = 18 * MILLIS;
+        let mut rhythm = Rhythm::new();
+        (0..3).for_each(|_| rhythm.complete(DURATION));
+        let (mut reads, mut late) = (0, 0);
+        for n in 0..400 {
+            rhythm.begin(0);
+            let mut now = rhythm.rest(0).unwrap() + lateness * (n % 7) / 6;
+            let mut count = 1;
+            rhythm.note_read();
+            let is_late = now >= DURATION;
+            while now < DURATION {
+                // The last chunk ends with the telegram.
+                now = DURATION - (DURATION - now - 1) / chunk * chunk;
+                rhythm.note_read();
+                count += 1;
+            }
+            rhythm.complete(DURATION);
+            if n >= 200 {
+                (reads, late) = (reads + count, late + u32::from(is_late));
+            }
+        }
+        (f64::from(reads) / 200.0, late)
+    }
+
+    #[test]
+    fn lead_leaves_one_chunk() {
+        for (chunk, lateness) in [(320, 60), (320, 150), (1_240, 60), (1_240, 400), (80, 30)] {
+            let (reads, late) = play(chunk * MICROS, lateness * MICROS);
+            assert!(reads < 2.2 || chunk < MIN_LEAD / MICROS, "{chunk} us, {lateness} us: {reads} reads");
+            assert!(late <= 20, "{chunk} us, {lateness} us: {late} of 200 late");
+        }
+        // Sleeps that are late by more than a chunk leave two chunks, or are too late.
+        let (reads, late) = play(320 * MICROS, 500 * MICROS);
+        assert!(reads < 2.5 && late <= 40, "{reads} reads, {late} late");
     }
 
     #[test]

@@ -234,6 +234,7 @@ impl line::Protocol for Session {
         }
         let was_empty = self.framer.buffered() == 0;
         self.framer.commit(len);
+        self.rhythm.note_read();
         self.last_byte = now;
         self.dialogue.on_bytes();
         if was_empty {
