@@ -61,6 +61,8 @@ pub(crate) struct Framer {
     expect: Expect,
     /// Whether the next packet must begin at the end of the last one.
     is_locked: bool,
+    /// Whether a packet has arrived since the last descriptor of packets.
+    has_packet: bool,
     /// Number of bytes discarded since the last packet.
     skipped: u32,
     /// Number of printable ones in a row, the last of them, and whether they contain [`NAME`].
@@ -100,6 +102,7 @@ impl Framer {
             buffer: Buffer::new(HOLD),
             expect,
             is_locked: false,
+            has_packet: false,
             skipped: 0,
             text: 0,
             last_text: [0; NAME.len()],
@@ -131,7 +134,7 @@ impl Framer {
                     Some(Head::Stream(kind)) => {
                         let span = self.take(Head::LEN, 1);
                         self.expect(Expect::Packets(kind));
-                        self.is_locked = true;
+                        (self.is_locked, self.has_packet) = (true, false);
                         return Some(Found::Stream(span));
                     }
                     None if open.len() < Head::LEN => return None,
@@ -141,7 +144,7 @@ impl Framer {
             match self.step(most) {
                 Step::Take(packets) => {
                     let Expect::Packets(kind) = self.expect else { return None };
-                    self.is_locked = true;
+                    (self.is_locked, self.has_packet) = (true, true);
                     return Some(Found::Packets(kind, self.take(packets * kind.bytes(), packets)));
                 }
                 Step::Wait => return None,
@@ -189,12 +192,13 @@ impl Framer {
     }
 
     /// Returns whether the open bytes follow a packet and may be the next one. Then they are, even if they look like a response.
+    /// Before the first packet, a scanner may respond to a repeated request.
     fn is_at_packet(&self) -> bool {
         let may_be = |kind: Kind| match self.buffer.open().get(..kind.bytes()) {
             Some(packet) => kind.is_right(packet),
             None => kind.begins(self.buffer.open()),
         };
-        self.is_locked && self.kind().is_some_and(may_be)
+        self.is_locked && self.has_packet && self.kind().is_some_and(may_be)
     }
 
     fn step(&mut self, most: usize) -> Step {

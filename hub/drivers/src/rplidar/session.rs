@@ -37,8 +37,8 @@ pub struct Session {
     change_dtr: Option<bool>,
     handshake: Handshake,
     stream: Stream,
-    /// Whether the descriptor of the stream has arrived.
-    is_announced: bool,
+    /// Kind of the stream and arrival of its descriptor, once the descriptor has arrived.
+    announced: Option<(Kind, Nanos)>,
     counters: StreamCounters,
     /// Time since which there are no subscribers.
     idle_since: Option<Nanos>,
@@ -78,7 +78,7 @@ impl Session {
             change_dtr: None,
             handshake: Handshake::new(settings),
             stream: Stream::new(settings),
-            is_announced: false,
+            announced: None,
             counters: StreamCounters::default(),
             idle_since: None,
         };
@@ -119,7 +119,7 @@ impl Session {
     /// Begins again at the current rate. The session shows the state `shown` until measured data arrive.
     fn begin(&mut self, shown: State) {
         self.end_stream();
-        self.is_announced = false;
+        self.announced = None;
         self.shown = shown;
         if self.settings.listen_only {
             self.phase = Phase::Listening { since: self.now };
@@ -298,15 +298,15 @@ impl Session {
     /// Handles the descriptor of a stream.
     fn stream_begins(&mut self) {
         match self.phase {
-            // Another program has started another stream, in an unknown mode.
-            Phase::Streaming(_) if self.stream.is_begun() && !self.settings.listen_only => {
+            // Another stream, in an unknown mode: of another program, or of another scanner.
+            Phase::Streaming(_) if !self.settings.listen_only && !self.is_announced_again() => {
                 self.counters.note_resync();
                 self.begin(State::Starting);
             }
             Phase::Querying { query, .. } if !query.is_scan() => self.framer.expect(Expect::Answers),
             Phase::Querying { .. } | Phase::Listening { .. } | Phase::Streaming(_) => {
                 self.end_stream();
-                self.is_announced = true;
+                self.announced = self.framer.kind().map(|kind| (kind, self.now));
                 self.framer.kind().into_iter().for_each(|kind| self.handshake.stream_begins(kind));
                 let mut watchdog = self.continue_stream();
                 watchdog.await_spin_up(self.now + SPIN_UP);
@@ -318,6 +318,16 @@ impl Session {
                 self.framer.expect(Expect::Answers);
             }
         }
+    }
+
+    /// Returns whether the descriptor that has just arrived announces the session's own stream once more: the scanner
+    /// responds to a request and to its repetition. A head may need a second to reach its speed. During this time, another
+    /// scanner or program can start a stream, too.
+    fn is_announced_again(&self) -> bool {
+        let is_repeated = |(kind, at): (Kind, Nanos)| {
+            self.framer.kind() == Some(kind) && self.now < at + 2 * self.response_timeout()
+        };
+        !self.stream.is_begun() && self.announced.is_some_and(is_repeated)
     }
 
     /// Starts or extends the stream after packets have arrived. Returns its deadlines.
@@ -616,7 +626,7 @@ impl line::Session for Session {
     fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
         let Some(kind) = self.framer.kind() else { return Vec::new() };
         let (model, modes) = (self.model(), &self.handshake.modes);
-        if self.is_announced && self.info().is_some() && modes.is_unambiguous(kind) {
+        if self.announced.is_some() && self.info().is_some() && modes.is_unambiguous(kind) {
             return Vec::new();
         }
         let sample_us = self.stream.reported_us(model, beams);

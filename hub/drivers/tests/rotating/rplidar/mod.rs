@@ -248,6 +248,8 @@ pub(crate) struct Head {
     pub(crate) is_old: bool,
     /// Turns in a second.
     pub(crate) hz: f64,
+    /// Time from a request to its first point, in addition to the usual one.
+    pub(crate) spin_up: Nanos,
     /// Share by which its points take longer than it reports.
     pub(crate) drift: f64,
     /// Health status and error code.
@@ -316,6 +318,7 @@ impl Head {
             modes,
             is_old: false,
             hz: f64::from(model.turns_per_second()) * 1.000_7,
+            spin_up: 0,
             drift: 0.0,
             health: (0, 0),
             heals: true,
@@ -476,7 +479,7 @@ impl Head {
                 };
                 let len = kind.bytes() as u8;
                 self.answer(answer_of(kind), 0x40, &[len], now);
-                let zero = now + 10 * MILLIS + (self.before % 7_777) * 10_000;
+                let zero = now + self.spin_up + 10 * MILLIS + (self.before % 7_777) * 10_000;
                 self.doing = Doing::Measuring { kind, us, zero, packets: 0 };
             }
             command => panic!("{command:02X} must not be said"),

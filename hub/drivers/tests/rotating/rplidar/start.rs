@@ -6,7 +6,7 @@ use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Trouble};
 use scanhub_schema::MILLIS;
 
-use super::{Bench, Head, SECOND};
+use super::{Bench, Head, SECOND, answer_of};
 
 pub(crate) fn of(model: Model) -> Settings {
     Settings { model: Some(model.name()), ..Settings::default() }
@@ -311,6 +311,45 @@ fn a_second_without_data_begins_again() {
     bench.until(4 * SECOND, is_streaming);
     assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 1));
     assert_eq!(bench.session.account().lost, 0, "silence is no loss on the line");
+}
+
+/// Returns a bench with a scanner that has announced its stream and spins up.
+fn spinning_up(model: Model) -> Bench {
+    let mut bench = Bench::new(Settings::default(), Head { spin_up: SECOND, ..Head::new(model, 1) });
+    bench.until(SECOND, |bench| bench.head.is_measuring());
+    bench.run(bench.now + 20 * MILLIS);
+    assert!(bench.session.model() == Some(model) && bench.log.packets.is_empty());
+    bench
+}
+
+#[test]
+fn another_scanner_whose_stream_begins_during_the_spin_up_is_identified() {
+    // Packets of another kind, and packets of the same kind with another time per point.
+    for (before, model) in [(Model::S1, Model::A3), (Model::A3, Model::S1), (Model::A1, Model::A2m8)] {
+        let mut bench = spinning_up(before);
+        bench.run(bench.now + 500 * MILLIS);
+        let mut head = Head { spin_up: 300 * MILLIS, ..Head::new(model, 1) };
+        let request = [0xA5, 0x82, 5, head.typical, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ head.typical];
+        request.into_iter().for_each(|byte| head.write(byte, model.baud(), bench.now));
+        bench.head = head;
+        bench.until(3 * SECOND, is_streaming);
+        assert_eq!((bench.session.model(), bench.session.account().resyncs), (Some(model), 1), "{before:?}");
+        bench.run(bench.now + 3 * SECOND);
+        let (worst, wrong) = bench.judge(&bench.log.turns);
+        assert!(
+            bench.log.turns.len() > 20 && worst < 2 * MILLIS && wrong == 0,
+            "{before:?}: {worst} {wrong}"
+        );
+    }
+}
+
+#[test]
+fn a_stream_that_is_announced_twice_is_one_stream() {
+    let mut bench = spinning_up(Model::A1);
+    let kind = bench.head.kind().expect("measuring");
+    bench.head.answer(answer_of(kind), 0x40, &[kind.bytes() as u8], bench.now + 70 * MILLIS);
+    bench.until(3 * SECOND, is_streaming);
+    assert_eq!(bench.session.account().resyncs, 0);
 }
 
 #[test]
