@@ -138,10 +138,14 @@ impl Multi {
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         let bounds = Bounds::of(limits);
         self.compare(readings, bounds, classes);
-        for i in (0..readings.len()).filter(|&i| self.nearest[i] == INVALID) {
-            let nearest = &self.nearest[..readings.len()];
-            if readings[i] != INVALID && self.is_before_its_neighbours(i, readings[i], nearest, bounds) {
-                classes[i] = Class::Foreground;
+        let nearest = &self.nearest[..readings.len()];
+        let mut left = 0;
+        while let Some(ahead) = nearest[left..].iter().position(|&range| range == INVALID) {
+            let unknown = left + ahead;
+            let Some(count) = nearest[unknown..].iter().position(|&range| range != INVALID) else { break };
+            left = unknown + count;
+            if let Some(right) = unknown.checked_sub(1) {
+                self.compare_with_neighbors(right, left, readings, bounds, classes);
             }
         }
         self.runs.keep(readings, limits, classes);
@@ -173,17 +177,26 @@ impl Multi {
         }
     }
 
-    /// Returns whether beam `i`, whose own background is unknown, ends nearer than its neighbors on both sides, and
-    /// meets nothing that it has met for a while.
-    fn is_before_its_neighbours(&self, i: usize, reading: u16, nearest: &[u16], bounds: Bounds) -> bool {
-        let known = |range: &&u16| **range != INVALID;
-        let right = nearest[i.saturating_sub(ASIDE)..i].iter().rev().find(known);
-        let left = nearest[i + 1..(i + 1 + ASIDE).min(nearest.len())].iter().find(known);
-        let (Some(&right), Some(&left)) = (right, left) else { return false };
-        let met = |slots: &Slots| {
-            slots.weight[i] >= bounds.replaced && slots.range[i].abs_diff(reading) <= bounds.threshold
-        };
-        reading < right.min(left).saturating_sub(bounds.threshold) && !self.slots.iter().any(met)
+    /// Classifies the beams between `right` and `left`, which are the only ones of them with a known background. A beam
+    /// that is near both is foreground if it ends nearer than both, and meets nothing that it has met for a while.
+    fn compare_with_neighbors(
+        &self,
+        right: usize,
+        left: usize,
+        readings: &[u16],
+        bounds: Bounds,
+        classes: &mut [Class],
+    ) {
+        let limit = self.nearest[right].min(self.nearest[left]).saturating_sub(bounds.threshold);
+        for i in left.saturating_sub(ASIDE).max(right + 1)..left.min(right + ASIDE + 1) {
+            let reading = readings[i];
+            let met = |slots: &Slots| {
+                slots.weight[i] >= bounds.replaced && slots.range[i].abs_diff(reading) <= bounds.threshold
+            };
+            if reading < limit && reading != INVALID && !self.slots.iter().any(met) {
+                classes[i] = Class::Foreground;
+            }
+        }
     }
 
     /// Updates the surfaces. The one nearest to a reading, within the threshold, was met. The others lose weight: those
