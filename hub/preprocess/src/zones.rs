@@ -376,7 +376,9 @@ impl Table {
         };
         let beams = ranges.iter().zip(&self.tells);
         let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
-        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges, spacing) }
+        // Every beam of an LMS is measured.
+        let is_complete = invalid == 0 || !ranges.contains(&Scan::NOT_MEASURED);
+        if is_complete { invalid } else { invalid - self.looked_past(ranges, spacing) }
     }
 
     /// Returns the number of relevant beams that were not measured, but have measured ones near enough on both sides.
