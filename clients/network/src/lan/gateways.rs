@@ -31,8 +31,8 @@ pub const MAX_EPOCHS: usize = 1024;
 /// were sent earlier are not counted. An announcement that arrives after the first datagram therefore says nothing about
 /// earlier ones, and a late datagram from before the start moves the start back.
 ///
-/// The counters of an evicted run are added to [`evicted`](GatewayTable::evicted). Rows and evicted totals together
-/// therefore always count everything that was accepted.
+/// The counters of an evicted run, and of a gateway that is forgotten with its last run, are added to
+/// [`evicted`](GatewayTable::evicted). Rows and evicted totals together therefore always count everything that was accepted.
 ///
 /// Two gateways with the same number and epoch are distinguished by their senders and announcements, and only the first
 /// one is accepted. After 3 s of its silence, another sender is accepted as a new run, but not if two gateways are known
@@ -63,6 +63,8 @@ struct Gateway {
     runs: BTreeMap<u32, Run>,
     kept_epoch: Option<KeptEpoch>,
     duplicates: DuplicateDetector,
+    /// Whether the difference of its clock was reported. Such a gateway is never forgotten, so that the report is not
+    /// repeated. There are at most [`MAX_RUNS`] of them.
     is_clock_reported: bool,
     /// Samples that did not fit into the memory that remote sensors may use.
     no_room: u64,
@@ -78,8 +80,10 @@ struct KeptEpoch {
 struct Run {
     /// Time at which the run was accepted.
     since_ns: u64,
-    /// Order in which active runs were accepted, or retired ones retired.
-    order: u64,
+    /// Order in which runs were accepted.
+    accepted: u64,
+    /// Order in which runs retired; `None` for the active run of a gateway.
+    retired: Option<u64>,
     standing: Standing,
     senders: Senders,
     delays: Delays,
@@ -102,7 +106,7 @@ struct Sensor {
 /// Gateway and epoch of a run.
 type RunId = (u64, u32);
 
-/// Totals of the runs that were evicted.
+/// Totals of the runs that were evicted, and of the gateways that were forgotten with them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct EvictedTotals {
     /// Runs of gateways.
@@ -117,6 +121,8 @@ pub struct EvictedTotals {
     pub duplicate: u64,
     /// Sequence numbers among `received` that arrived after a higher one.
     pub reordered: u64,
+    /// Samples of forgotten gateways that did not fit into the memory that remote sensors may use.
+    pub no_room: u64,
 }
 
 /// What the table knows about a datagram that it accepted.
@@ -411,7 +417,8 @@ impl GatewayTable {
         }
     }
 
-    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and their number.
+    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and the number of
+    /// these samples. Those of forgotten gateways are in [`EvictedTotals::no_room`].
     pub fn no_room(&self) -> impl Iterator<Item = (u64, u64)> {
         let all = self.gateways.iter().map(|(hub, gateway)| (*hub, gateway.no_room));
         all.filter(|(_, no_room)| *no_room > 0)
@@ -447,7 +454,7 @@ impl GatewayTable {
             if let Some((_, first)) = kept.min() {
                 self.gateways.entry(first).and_modify(|gateway| gateway.kept_epoch = None);
                 self.epoch_count -= 1;
-                self.drop_if_unused(first);
+                self.forget_if_unused(first);
             }
         }
     }
@@ -504,8 +511,9 @@ impl GatewayTable {
         let (hub, epoch) = run_id;
         let order = self.order();
         let runs = &mut self.gateways.entry(hub).or_default().runs;
-        if let Some(mut retired) = runs.last_entry() {
-            retired.get_mut().order = order;
+        if let Some(mut last) = runs.last_entry() {
+            // After the end of an active run, the last one retired before and keeps its order.
+            last.get_mut().retired.get_or_insert(order);
         }
         runs.insert(epoch, Run::new(arrival.now_ns, order));
         self.run_count += 1;
@@ -517,23 +525,23 @@ impl GatewayTable {
     fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
         let (evicted, is_displaced) = self.next_evicted(run_id, arrival)?;
         self.end(evicted, is_displaced);
-        self.drop_if_unused(evicted.0);
+        self.forget_if_unused(evicted.0);
         Some(evicted)
     }
 
     /// Returns the run that is evicted next to make room for `run_id`, and whether it is still active.
     fn next_evicted(&self, run_id: RunId, arrival: Arrival) -> Option<(RunId, bool)> {
-        let all = self.gateways.iter().flat_map(|(hub, gateway)| {
-            let active = gateway.runs.last_key_value().map(|(epoch, _)| *epoch);
-            gateway.runs.iter().map(move |(epoch, run)| ((*hub, *epoch), Some(*epoch) == active, run))
-        });
-        let rank = |is_active, run: &Run| {
-            (is_active, if is_active { run.standing.worth_ns() } else { 0 }, run.order)
-        };
+        let all = self
+            .gateways
+            .iter()
+            .flat_map(|(hub, gateway)| gateway.runs.iter().map(move |(epoch, run)| ((*hub, *epoch), run)));
         let may_go =
-            all.filter(|&(id, is_active, run)| id != run_id && (!is_active || run.standing.may_go(arrival)));
-        let first = may_go.min_by_key(|&(_, is_active, run)| rank(is_active, run));
-        first.map(|(id, is_active, _)| (id, is_active))
+            all.filter(|&(id, run)| id != run_id && (run.retired.is_some() || run.standing.may_go(arrival)));
+        let rank = |run: &Run| match run.retired {
+            Some(retired) => (false, 0, retired),
+            None => (true, run.standing.worth_ns(), run.accepted),
+        };
+        may_go.min_by_key(|(_, run)| rank(run)).map(|(id, run)| (id, run.retired.is_none()))
     }
 
     /// Removes a run, and adds its counters to the totals.
@@ -554,10 +562,15 @@ impl GatewayTable {
         self.row_count -= run.rows().count();
     }
 
-    fn drop_if_unused(&mut self, hub: u64) {
-        let is_unused = |gateway: &Gateway| gateway.runs.is_empty() && gateway.kept_epoch.is_none();
+    /// Forgets a gateway without runs, unless its epoch is kept or the difference of its clock was reported. Adds its
+    /// counter to the totals.
+    fn forget_if_unused(&mut self, hub: u64) {
+        let is_unused = |gateway: &Gateway| {
+            gateway.runs.is_empty() && gateway.kept_epoch.is_none() && !gateway.is_clock_reported
+        };
         if self.gateways.get(&hub).is_some_and(is_unused) {
-            self.gateways.remove(&hub);
+            let forgotten = self.gateways.remove(&hub);
+            self.evicted.no_room += forgotten.map_or(0, |gateway| gateway.no_room);
         }
     }
 
@@ -575,9 +588,9 @@ impl Gateway {
 }
 
 impl Run {
-    fn new(since_ns: u64, order: u64) -> Run {
+    fn new(since_ns: u64, accepted: u64) -> Run {
         let (standing, senders, delays) = (Standing::NONE, Senders::NONE, Delays::default());
-        Run { since_ns, order, standing, senders, delays, sensors: BTreeMap::new() }
+        Run { since_ns, accepted, retired: None, standing, senders, delays, sensors: BTreeMap::new() }
     }
 
     fn rows(&self) -> impl Iterator<Item = &Row> {
@@ -1094,6 +1107,46 @@ mod tests {
         assert_eq!(announce(&mut table, 1, 4000, 2000), None);
         assert_eq!(age_ns(&table, 5000, 3030), None);
         assert!((2..1000).all(|epoch| announce(&mut table, epoch, 3000, 1000).is_none()), "the same gateway");
+    }
+
+    #[test]
+    fn evicted_gateways_keep_their_counters_and_clock_reports() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let differing = |hub, epoch| Head { stamp_ns: 3_000 * MS, ..head(hub, epoch, 0) };
+        let announce = |table: &mut GatewayTable, hub, epoch, at_ms| {
+            hear(table, (hub, epoch), announces(at_ms));
+            table.announce(&differing(hub, epoch), &Announce::new(1, "front", ""), 1_000 * MS).0
+        };
+        assert_eq!(announce(&mut table, 5, 1, 0), Some(-2_000 * MS as i64));
+        table.count_no_room(5);
+        table.count_no_room(5);
+        // Gateways whose clocks were not reported are dropped with their last run.
+        hear(&mut table, (6, 1), announces(0));
+        table.count_no_room(6);
+        for hub in 0..MAX_RUNS as u64 {
+            hear(&mut table, (100 + hub, 1), announces(1 + hub));
+        }
+        assert!(!contains(&table, (5, 1)) && !contains(&table, (6, 1)));
+        let counted = table.evicted().no_room + table.no_room().map(|(_, count)| count).sum::<u64>();
+        assert_eq!(counted, 3);
+        assert_eq!(announce(&mut table, 5, 2, 1_000), None, "reported before");
+        // Any number of gateways with other clocks are reported up to a limit, and take no more memory.
+        let reported = (1_000..2_000).filter(|&hub| announce(&mut table, hub, 1, hub).is_some()).count();
+        assert_eq!(reported, MAX_RUNS - 1);
+        assert!(table.gateways.len() <= 2 * MAX_RUNS, "{}", table.gateways.len());
+    }
+
+    #[test]
+    fn successor_of_a_silent_gateway_does_not_reorder_retired_runs() {
+        let mut table = GatewayTable::new(&Topic::ALL);
+        for (hub, epoch) in [(5, 1), (5, 2), (6, 1), (6, 2)] {
+            assert_eq!(at(&mut table, &zones(head(hub, epoch, 0)), 0), Ok(Fresh::New));
+        }
+        let (fresh, now_ns) = (zones(head(5, 2, 0)), 6_000 * MS);
+        assert!(table.receive(&fresh, 2, now_ns).is_ok_and(|(_, fresh)| fresh == Fresh::New));
+        assert_eq!(table.evicted().runs, 1, "the silent run has ended");
+        let evicted = [(); 2].map(|()| table.evict((9, 9), announces(6_000)));
+        assert_eq!(evicted, [Some((5, 1)), Some((6, 1))], "the run that retired first goes first");
     }
 
     #[test]

@@ -453,23 +453,26 @@ struct Sums {
     lost: u64,
     duplicate: u64,
     reordered: u64,
+    no_room: u64,
 }
 
 impl Sums {
     fn new(given_up: EvictedTotals, class: &'static str) -> Sums {
-        let EvictedTotals { runs: lives, displaced, received, lost, duplicate, reordered } = given_up;
-        Sums { class, lives, displaced, received, lost, duplicate, reordered }
+        let EvictedTotals { runs: lives, displaced, received, lost, duplicate, reordered, no_room } =
+            given_up;
+        Sums { class, lives, displaced, received, lost, duplicate, reordered, no_room }
     }
 
     /// Writes the counters as text.
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Sums { lives, displaced, received, lost, duplicate, reordered, .. } = self;
+        let Sums { lives, displaced, received, lost, duplicate, reordered, no_room, .. } = self;
         write!(
             line,
             "of {lives} former starts of gateways together, {displaced} of them given up for others: "
         )?;
         write!(line, "received {received}, lost {lost}, ")?;
-        write!(line, "duplicate {duplicate}, reordered {reordered}")
+        write!(line, "duplicate {duplicate}, reordered {reordered}")?;
+        if *no_room > 0 { write!(line, ", {no_room} beyond --memory") } else { Ok(()) }
     }
 }
 
