@@ -7,22 +7,94 @@
 pub mod address;
 mod gateways;
 pub mod incoming;
-mod key;
 pub mod outgoing;
 mod reassembly;
 pub mod republish;
 mod senders;
 mod sequence;
 
-pub use gateways::{Arrival, EvictedTotals, GatewayTable, MAX_EPOCHS, MAX_ROWS, MAX_RUNS, Standing};
-pub use key::Key;
+use hmac::{Hmac, KeyInit, Mac};
+use scanhub_schema::datagram::{MAC, covered};
+use sha2::Sha256;
+
+pub(crate) use gateways::MAX_EPOCHS;
+pub use gateways::{EvictedTotals, GatewayTable, MAX_ROWS, MAX_RUNS};
 pub use sequence::{Fresh, Row, WINDOW};
 
-/// A moment on two clocks, in ns.
+/// Timestamp of two clocks, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Stamp {
-    /// A clock that is never set, such as CLOCK_MONOTONIC.
+    /// Time of a clock that is never set, such as CLOCK_MONOTONIC.
     pub monotonic_ns: u64,
-    /// The wall clock, since 1970.
+    /// Time of the wall clock, since 1970.
     pub wall_ns: u64,
+}
+
+/// Key that the gateways and listeners of one network share. Listeners accept every datagram that is authenticated with it.
+#[derive(Clone)]
+pub struct Key(Hmac<Sha256>);
+
+impl Key {
+    /// Length of a key, in bytes.
+    pub const LEN: usize = 32;
+
+    /// Creates a key of these bytes.
+    pub fn new(bytes: &[u8; Key::LEN]) -> Key {
+        let mut block = [0; 64];
+        block[..Key::LEN].copy_from_slice(bytes);
+        // A key is padded with zeros to a block of the hash (RFC 2104).
+        Key(Hmac::new(&block.into()))
+    }
+
+    /// Returns the MAC of `covered`, which is header and payload with a checksum of 0. It is the first half of HMAC-SHA256.
+    pub fn mac(&self, covered: &[u8]) -> [u8; MAC] {
+        let whole = self.0.clone().chain_update(covered).finalize().into_bytes();
+        std::array::from_fn(|at| whole[at])
+    }
+
+    /// Returns whether `mac` was computed with this key for the datagram `bytes`, whose header is valid.
+    pub fn is_of(&self, bytes: &[u8], mac: &[u8; MAC]) -> bool {
+        let digest =
+            covered(bytes).into_iter().fold(self.0.clone(), |digest, piece| digest.chain_update(piece));
+        digest.verify_truncated_left(mac).is_ok()
+    }
+
+    /// Returns a name of 16 hex digits that does not reveal the key.
+    pub fn name(&self) -> String {
+        self.mac(b"name").iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+impl std::fmt::Debug for Key {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Key({})", self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use scanhub_schema::datagram::{Datagram, HEAD, Head};
+
+    use super::*;
+
+    #[test]
+    fn mac_belongs_to_one_key() {
+        let (key, other) = (Key::new(&[7; 32]), Key::new(&[8; 32]));
+        let mut buffer = [0; 200];
+        buffer[HEAD..HEAD + 3].copy_from_slice(b"abc");
+        let bytes =
+            Head { hub: 3, ..Head::default() }.seal_with(&mut buffer, 3, |covered| key.mac(covered)).unwrap();
+        let mac = *Datagram::read(bytes).unwrap().mac.unwrap();
+        assert!(key.is_of(bytes, &mac) && !other.is_of(bytes, &mac));
+        let mut other = bytes.to_vec();
+        other[HEAD] ^= 1;
+        assert!(!key.is_of(&other, &mac));
+        assert!(!key.is_of(bytes, &[0; MAC]));
+    }
+
+    #[test]
+    fn debug_output_does_not_reveal_the_key() {
+        let shown = format!("{:?}", Key::new(&[0x61; 32]));
+        assert!(!shown.contains("6161") && !shown.contains("aaa") && shown.len() == 21, "{shown}");
+    }
 }

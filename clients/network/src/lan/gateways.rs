@@ -23,7 +23,7 @@ pub const MAX_RUNS: usize = 64;
 /// Maximum number of sensors and topics, of all runs together, that are counted separately.
 pub const MAX_ROWS: usize = 1024;
 /// Maximum number of gateways with a key whose epochs are kept. A recording of a forgotten one is refused by its time.
-pub const MAX_EPOCHS: usize = 1024;
+pub(crate) const MAX_EPOCHS: usize = 1024;
 
 /// Gateways that a receiver distinguishes: their runs, sensors, senders, clocks and counters.
 ///
@@ -336,7 +336,7 @@ impl GatewayTable {
 
     /// Returns whether two gateways are known to send under this number and epoch. All datagrams of one of them are
     /// refused as [`DatagramError::Twin`].
-    pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {
+    fn is_shared(&self, hub: u64, epoch: u32) -> bool {
         self.find((hub, epoch)).is_ok_and(|run| run.is_some_and(|run| run.senders.is_shared()))
     }
 
@@ -397,7 +397,7 @@ impl GatewayTable {
 
     /// Returns the name of the sensor of a row, as [`name`](Self::name) does, but `#` and its number if it had several
     /// names, because the row counts the samples of each of them.
-    pub fn row_name(&self, row: &Row) -> String {
+    pub(crate) fn row_name(&self, row: &Row) -> String {
         match self.sensor(row.hub, row.epoch, row.sensor) {
             Some(sensor) if sensor.is_renamed => format!("#{}", row.sensor),
             _ => self.name(row.hub, row.epoch, row.sensor),
@@ -605,16 +605,16 @@ impl Run {
 
 /// Kind and time of a received datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Arrival {
+pub(super) struct Arrival {
     /// Whether it is a sample rather than an announcement.
-    pub delivers: bool,
+    pub(super) delivers: bool,
     /// Time of arrival, in ns of a clock that is never set.
-    pub now_ns: u64,
+    pub(super) now_ns: u64,
 }
 
 /// Rank of a run when there is no room for another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Standing {
+pub(super) struct Standing {
     heard_ns: u64,
     /// Times of the first and the last sample.
     delivered_ns: Option<(u64, u64)>,
@@ -627,10 +627,10 @@ const KEPT_NS: u64 = 60_000_000_000;
 
 impl Standing {
     /// Rank of a run from which nothing was accepted.
-    pub const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
+    pub(super) const NONE: Standing = Standing { heard_ns: 0, delivered_ns: None };
 
     /// Records that a datagram was accepted.
-    pub fn take(&mut self, arrival: Arrival) {
+    pub(super) fn take(&mut self, arrival: Arrival) {
         let now_ns = arrival.now_ns;
         self.heard_ns = now_ns;
         if arrival.delivers {
@@ -640,7 +640,7 @@ impl Standing {
 
     /// Returns whether the run may be evicted for a run that `arrival` belongs to. It may if it has not delivered for 3
     /// s. For a sample, it also may if it has delivered for less than a second.
-    pub fn may_go(&self, arrival: Arrival) -> bool {
+    pub(super) fn may_go(&self, arrival: Arrival) -> bool {
         let silent_ns = |(_, last_ns): (u64, u64)| arrival.now_ns.saturating_sub(last_ns);
         let is_busy = self.delivered_ns.is_some_and(|delivered_ns| silent_ns(delivered_ns) < SILENCE_NS);
         !is_busy || arrival.delivers && !self.is_proven()
@@ -648,7 +648,7 @@ impl Standing {
 
     /// Returns the time until which the run counts as active. Of the runs that may be evicted, the one with the lowest
     /// value is evicted first.
-    pub fn worth_ns(&self) -> u64 {
+    pub(super) fn worth_ns(&self) -> u64 {
         match self.delivered_ns {
             None => self.heard_ns,
             Some((_, last_ns)) => last_ns + if self.is_proven() { KEPT_NS } else { SILENCE_NS },
@@ -656,7 +656,7 @@ impl Standing {
     }
 
     /// Returns whether the run is known to deliver: a second or more passed between its first and its last sample.
-    pub fn is_proven(&self) -> bool {
+    pub(super) fn is_proven(&self) -> bool {
         self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= PROVEN_NS)
     }
 }

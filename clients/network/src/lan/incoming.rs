@@ -197,12 +197,12 @@ impl Incoming {
     }
 
     /// Counts a sample of `hub` that did not fit into the memory that remote sensors may use.
-    pub fn count_no_room(&mut self, hub: u64) {
+    pub(crate) fn count_no_room(&mut self, hub: u64) {
         self.gateways.count_no_room(hub);
     }
 
     /// Returns the name of the sensor that sent `head`, which is printed now: its name, or `#` and its number.
-    pub fn printed_name(&mut self, head: &Head) -> String {
+    pub(crate) fn printed_name(&mut self, head: &Head) -> String {
         self.gateways.printed_name(head)
     }
 

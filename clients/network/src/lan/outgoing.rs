@@ -1,135 +1,175 @@
-//! What a gateway makes of the samples of a hub's sensors: whole datagrams, with announcements, thinned and numbered. A
-//! sample goes in with the time, datagrams come out at once. Refuses to know sockets and clocks.
+//! The sending end of a network: turns samples of a hub's sensors into whole datagrams, with announcements, thinned and
+//! numbered.
+//!
+//! A sample is an argument, and so is the time. Datagrams go to a [`Transmit`] at once, or wait until
+//! [`Outgoing::hand`] takes them.
 
-mod numbering;
-mod sample;
+mod datagram_writer;
 mod sensor;
-mod slots;
 
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use scanhub_schema::Topic;
+use scanhub_schema::datagram::Packed;
+use scanhub_schema::{Header, Topic};
 
 use crate::lan::Stamp;
-use numbering::Numbering;
-pub use numbering::{Form, Handed, Row, Rows, Transmit};
-pub use sample::{PayloadRef, Sample};
+use datagram_writer::DatagramWriter;
+pub use datagram_writer::{Form, Handed, Row, Rows, Transmit};
 use sensor::Sensor;
 
-/// The outgoing end of one gateway in one of its lives.
+/// Sending end of one gateway in one run.
 pub struct Outgoing {
-    numbering: Numbering,
+    writer: DatagramWriter,
     sensors: Vec<Sensor>,
 }
 
-/// Between two announcements of a sensor.
+/// Interval between the announcements of a sensor.
 pub const ANNOUNCE_EVERY: Duration = Duration::from_secs(1);
 
+/// A sample of a topic, or a silence.
+#[derive(Clone, Copy, Debug)]
+pub struct Sample<'a> {
+    /// Header of the sample. `None` for a silence: the payload then says that nothing is known, and no hub has sent it.
+    pub header: Option<&'a Header>,
+    /// Samples of the topic that were sent before it and were not received here.
+    pub missed: u64,
+    /// Payload, which determines the topic.
+    pub payload: PayloadRef<'a>,
+}
+
+/// Generates [`PayloadRef`] from the table of topics.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        /// Payload of any topic.
+        #[derive(Clone, Copy, Debug)]
+        pub enum PayloadRef<'a> {
+            $(#[doc = $about] $topic(&'a scanhub_schema::payload_type!($payload)),)*
+        }
+
+        impl PayloadRef<'_> {
+            /// Returns the topic of the payload.
+            pub fn topic(self) -> Topic {
+                match self { $(PayloadRef::$topic(_) => Topic::$topic,)* }
+            }
+
+            /// Writes the payload in its form for networks to the start of `room`, and returns its length. `None` if there
+            /// is too little room.
+            pub fn pack(self, room: &mut [u8]) -> Option<usize> {
+                match self { $(PayloadRef::$topic(payload) => payload.pack(room),)* }
+            }
+        }
+    };
+}
+
+scanhub_schema::for_each_topic!(payloads);
+
 impl Outgoing {
-    /// Makes the end of gateway `hub` in its life `epoch`. Its datagrams have at most `longest` bytes, and never more than
+    /// Creates the end of gateway `hub` in its run `epoch`. Its datagrams have at most `longest` bytes, and never more than
     /// [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
     pub fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Outgoing {
-        Outgoing { numbering: Numbering::new(hub, epoch, form, longest), sensors: Vec::new() }
+        Outgoing { writer: DatagramWriter::new(hub, epoch, form, longest), sensors: Vec::new() }
     }
 
-    /// Makes the end of gateway `hub` in its life `epoch` for a way that is slow at times: of each sensor and topic the newest
-    /// sample waits until [`hand`](Outgoing::hand) asks for it. Samples are whole, in one datagram however long.
+    /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of each
+    /// sensor and topic waits until [`hand`](Outgoing::hand) takes it. A sample is one datagram, however long it is.
     pub fn waiting(hub: u64, epoch: u32) -> Outgoing {
-        Outgoing { numbering: Numbering::waiting(hub, epoch), sensors: Vec::new() }
+        Outgoing { writer: DatagramWriter::waiting(hub, epoch), sensors: Vec::new() }
     }
 
-    /// Takes the sensor called `name`, of whose topics every so many samples go out; nothing: none do. Returns its position,
-    /// by which it is named from now on.
+    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent. Returns the
+    /// sensor's position, which identifies it from now on.
     pub fn follow(&mut self, name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.sensors.push(Sensor::new(name, every));
         self.sensors.len() - 1
     }
 
-    /// Returns the position of the sensor called `name`, if it was taken.
+    /// Returns the position of the sensor called `name`, if it was added.
     pub fn position(&self, name: &str) -> Option<usize> {
         self.sensors.iter().position(|sensor| sensor.name == name)
     }
 
-    /// Returns whether samples of this topic are wanted: they go out, or an announcement says what they say.
+    /// Returns whether samples of this topic are needed, because they are sent or an announcement contains something of them.
     pub fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        let is_announced = self.numbering.announces();
+        let is_announced = self.writer.announces();
         self.sensors[sensor].sends(topic) || is_announced && topic == Topic::Status
     }
 
-    /// Takes a sample of the sensor at this position, or a silence of its zones, and hands what becomes of it to `to`: before
-    /// the first sample of a life of the hub an announcement; no datagram if the sample is thinned away, if it is a background
-    /// that went out, or if it came from another machine.
+    /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of a run of
+    /// the hub, it sends an announcement. It sends nothing if the sample is thinned out, is a background that was sent before,
+    /// or comes from another machine.
     pub fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: Stamp, to: &mut impl Transmit) {
-        self.sensors[sensor].take(sample, now, &mut self.numbering, to);
+        self.sensors[sensor].send(sample, now, &mut self.writer, to);
     }
 
-    /// Announces all sensors of which anything was heard. To be called each [`ANNOUNCE_EVERY`], and at the end.
+    /// Announces all sensors that have sent a sample. Call it every [`ANNOUNCE_EVERY`], and at the end.
     pub fn announce(&mut self, now: Stamp, to: &mut impl Transmit) {
-        self.sensors.iter().for_each(|sensor| sensor.announce(now, &mut self.numbering, to));
+        self.sensors.iter().for_each(|sensor| sensor.announce(now, &mut self.writer, to));
     }
 
-    /// Sends all backgrounds again that went out longer than `every` ago.
+    /// Sends each background again whose last transmission is `every` or longer ago.
     pub fn repeat(&mut self, every: Duration, now: Stamp, to: &mut impl Transmit) {
-        self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.numbering, to));
+        self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.writer, to));
     }
 
-    /// Returns the sample that has waited for longest, with its number, as it is sent `now`; nothing if none waits.
+    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none waits.
     pub fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
-        self.numbering.hand(now)
+        self.writer.take_next(now)
     }
 
     /// Returns whether a sample waits.
     pub fn is_waiting(&self) -> bool {
-        self.numbering.is_waiting()
+        self.writer.is_waiting()
     }
 
-    /// Takes note that the last sample which [`hand`](Outgoing::hand) returned of this sensor and topic, of so many `bytes`,
-    /// went nowhere: its number is used up.
+    /// Counts the last sample that [`hand`](Outgoing::hand) returned for this sensor and topic, of `bytes` bytes, as failed. Its
+    /// number stays in use.
     pub fn not_taken(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
-        self.numbering.not_taken(sensor, topic, bytes);
+        self.writer.mark_failed(sensor, topic, bytes);
     }
 
-    /// Returns the announcement (no topic), the status or the background of the sensor called `name` that was handed on last,
-    /// as it is sent again `now` to who asks: with the number that it has, so that it is counted once.
+    /// Returns the announcement (no topic), the status or the background of the sensor called `name` that
+    /// [`hand`](Outgoing::hand) returned last, for a receiver that queries it at `now`. It has the number that it had before,
+    /// so that receivers count it once.
     pub fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
-        self.numbering.again(name, topic, now)
+        self.writer.resend_last(name, topic, now)
     }
 
     /// Returns the sensors and topics (`None`: announcements) for which [`again`](Outgoing::again) has a sample. The
     /// announcement of a sensor comes before its samples.
     pub fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
-        self.numbering.kept()
+        self.writer.kept()
     }
 
     /// Drops the samples that [`again`](Outgoing::again) returns.
     pub fn forget_kept(&mut self) {
-        self.numbering.forget_kept();
+        self.writer.forget_kept();
     }
 
-    /// Returns whether samples wait, so that newer ones may replace them: then announcements say how many were.
-    pub fn tells_replaced(&self) -> bool {
-        self.numbering.tells_replaced()
+    /// Returns whether samples wait, so that newer ones may replace them. Announcements then contain the number of replaced
+    /// samples.
+    pub(crate) fn tells_replaced(&self) -> bool {
+        self.writer.counts_replaced()
     }
 
-    /// Returns the longest datagram that goes out, in bytes.
+    /// Returns the maximum length of a datagram, in bytes.
     pub fn longest(&self) -> usize {
-        self.numbering.longest()
+        self.writer.longest()
     }
 
-    /// Returns the account, by the sensors' numbers in the hub.
+    /// Returns the counters of each sensor, by its number in the hub.
     pub fn account(&self) -> impl Iterator<Item = &Rows> {
-        self.numbering.sensors()
+        self.writer.sensors()
     }
 
-    /// Returns the number of samples that did not fit into as many datagrams as one may have.
+    /// Returns the number of samples that did not fit into the maximum number of parts.
     pub fn unfit(&self) -> u64 {
-        self.numbering.unfit()
+        self.writer.unfit()
     }
 
-    /// Returns `SENSOR/TOPIC` of which something did not fit into a datagram; each is told once.
-    pub fn misfit(&mut self) -> Option<String> {
-        self.numbering.misfit()
+    /// Returns a `SENSOR/TOPIC` whose samples do not all fit into datagrams, each of them once.
+    pub(crate) fn misfit(&mut self) -> Option<String> {
+        self.writer.take_oversized()
     }
 }
 

@@ -9,8 +9,9 @@ use std::collections::VecDeque;
 use scanhub_schema::datagram::{Announce, Head};
 use scanhub_schema::{Failure, Header, Topic, Wake};
 
+use super::Stamp;
+use super::gateways::Arrival;
 use super::incoming::{Announcement, CheckedPayload, Remote, RemoteSample};
-use super::{Arrival, Stamp};
 use remote_sensor::{Outcome, RemoteSensor};
 
 /// Publisher of all remote sensors in a domain.
@@ -52,7 +53,7 @@ pub struct LeftOut {
 }
 
 /// Maximum number of sensors. Anyone who can send to the network can announce some.
-pub const MAX_SENSORS: usize = 16;
+pub(crate) const MAX_SENSORS: usize = 16;
 
 /// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes milliseconds, and
 /// anyone who can send can cause it.

@@ -1,5 +1,4 @@
-//! One sensor of the hub on its way out: which of its samples become datagrams, and what is announced of it. Refuses to
-//! know what a datagram looks like.
+//! One sensor of the hub on the sending side: decides which of its samples become datagrams, and announces it.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -8,62 +7,62 @@ use std::time::Duration;
 use scanhub_schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
 use scanhub_schema::{Background, Family, Flags, Header, Quality, Topic, Verdict};
 
-use super::numbering::{Numbering, Transmit};
-use super::sample::{PayloadRef, Sample};
+use super::datagram_writer::{DatagramWriter, Transmit};
+use super::{PayloadRef, Sample};
 use crate::lan::Stamp;
 
-/// A sensor that is being followed.
+/// A subscribed sensor.
 pub(super) struct Sensor {
     pub(super) name: String,
     /// One for each of [`Topic::ALL`].
-    tracks: [Track; Topic::ALL.len()],
-    /// Of what came last; nothing as long as nothing did.
-    heard: Option<Header>,
-    turns: Turns,
-    /// As its status says; empty if unknown.
+    streams: [Stream; Topic::ALL.len()],
+    /// Header of the last sample of any topic.
+    last: Option<Header>,
+    revolutions: RevolutionCounter,
+    /// Type in the last status; empty if unknown.
     kind: String,
-    model: Option<Model>,
+    sent_background: Option<SentBackground>,
 }
 
-struct Track {
+/// State of one topic.
+struct Stream {
     topic: Topic,
-    /// Every how manieth sample goes out; nothing if none do.
+    /// Thinning factor; `None` if the topic is not sent.
     every: Option<NonZeroU64>,
     last: Option<Header>,
-    /// The last zones that went out were unknown.
+    /// Whether the last zones that were sent were unknown.
     is_unknown: bool,
 }
 
-/// The turns of a scanner whose head turns, counted: the numbers of the telegrams that complete them have gaps, which may all be
-/// of one length.
+/// Counts the revolutions of a rotating scanner, for thinning. The telegrams that complete them have sequence numbers with gaps,
+/// which may all have the same length.
 #[derive(Default)]
-struct Turns {
-    /// Of the last ones the number of the telegram, and their own.
+struct RevolutionCounter {
+    /// Sequence number of the telegram and index of the revolution, of the last revolutions.
     last: VecDeque<(u64, u64)>,
 }
 
-impl Turns {
-    /// The number of the turn of which a sample with `header` is made; nothing if it is none of those that are remembered.
-    fn number(&mut self, header: &Header) -> Option<u64> {
+impl RevolutionCounter {
+    /// Returns the index of the revolution that a sample with `header` is computed from. `None` if it is too old.
+    fn index(&mut self, header: &Header) -> Option<u64> {
         let newest = self.last.back().copied();
         if newest.is_none_or(|(seq, _)| header.seq > seq) && header.hub_time_ns().is_some() {
-            let number = newest.map_or(0, |(_, number)| number + 1);
-            if self.last.len() == REMEMBERED {
+            if self.last.len() == MAX_REVOLUTIONS {
                 self.last.pop_front();
             }
-            self.last.push_back((header.seq, number));
+            self.last.push_back((header.seq, self.next_index()));
         }
-        self.last.iter().rev().find(|(seq, _)| *seq == header.seq).map(|(_, number)| *number)
+        self.last.iter().rev().find(|(seq, _)| *seq == header.seq).map(|(_, index)| *index)
     }
 
-    /// The number of the turn that is being measured, of which an early warning is, whatever its own number.
-    fn next(&self) -> u64 {
-        self.last.back().map_or(0, |(_, number)| number + 1)
+    /// Returns the index of the revolution in progress, which an early warning belongs to.
+    fn next_index(&self) -> u64 {
+        self.last.back().map_or(0, |(_, index)| index + 1)
     }
 }
 
-/// The background as it went out last.
-struct Model {
+/// Background that was sent last.
+struct SentBackground {
     background: Box<Background>,
     header: Header,
     /// CLOCK_MONOTONIC, in ns.
@@ -71,153 +70,152 @@ struct Model {
 }
 
 impl Sensor {
-    /// The sensor called `name`, of whose topics every so many samples go out.
+    /// Creates the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
     pub(super) fn new(name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> Sensor {
-        let track = |topic| Track { topic, every: every(topic), last: None, is_unknown: false };
-        let tracks = Topic::ALL.map(track);
+        let stream = |topic| Stream { topic, every: every(topic), last: None, is_unknown: false };
         Sensor {
             name: name.to_owned(),
-            tracks,
-            heard: None,
-            turns: Turns::default(),
+            streams: Topic::ALL.map(stream),
+            last: None,
+            revolutions: RevolutionCounter::default(),
             kind: String::new(),
-            model: None,
+            sent_background: None,
         }
     }
 
-    /// Samples of this topic go out.
+    /// Returns whether samples of this topic are sent.
     pub(super) fn sends(&self, topic: Topic) -> bool {
-        self.tracks[topic as usize].every.is_some()
+        self.streams[topic as usize].every.is_some()
     }
 
-    /// Sends the background again if it went out longer than `every` ago.
+    /// Sends the background again if it was sent `every` or longer ago.
     pub(super) fn repeat(
         &mut self,
         every: Duration,
         now: Stamp,
-        numbering: &mut Numbering,
+        writer: &mut DatagramWriter,
         to: &mut impl Transmit,
     ) {
-        let is_due = |model: &&mut Model| {
-            u128::from(now.monotonic_ns.saturating_sub(model.sent_ns)) >= every.as_nanos()
+        let is_due = |sent: &&mut SentBackground| {
+            u128::from(now.monotonic_ns.saturating_sub(sent.sent_ns)) >= every.as_nanos()
         };
-        let Some(model) = self.model.as_mut().filter(is_due) else { return };
-        if numbering.is_claimed(model.header.sensor, &self.name) {
-            model.sent_ns = now.monotonic_ns;
-            let head = head(Topic::Background, &model.header, model.header.wall_ns);
-            numbering.send(head, to, |room| model.background.pack(room));
+        let Some(sent) = self.sent_background.as_mut().filter(is_due) else { return };
+        if writer.is_claimed(sent.header.sensor, &self.name) {
+            sent.sent_ns = now.monotonic_ns;
+            let head = head(Topic::Background, &sent.header, sent.header.wall_ns);
+            writer.send(head, to, |room| sent.background.pack(room));
         }
     }
 
-    /// Says who this is and which number each topic has next; nothing as long as nothing was heard of it.
-    pub(super) fn announce(&self, now: Stamp, numbering: &mut Numbering, to: &mut impl Transmit) {
-        let is_announced = numbering.announces();
-        let heard = self.heard.filter(|heard| is_announced && numbering.is_claimed(heard.sensor, &self.name));
-        let Some(heard) = heard else { return };
-        let mut announce = Announce::new(heard.boot, &self.name, &self.kind);
-        for topic in self.tracks.iter().filter(|track| track.every.is_some()).map(|track| track.topic) {
+    /// Announces the sensor's name, and the next number of each topic. Sends nothing before the sensor's first sample.
+    pub(super) fn announce(&self, now: Stamp, writer: &mut DatagramWriter, to: &mut impl Transmit) {
+        let is_announced = writer.announces();
+        let last = self.last.filter(|last| is_announced && writer.is_claimed(last.sensor, &self.name));
+        let Some(last) = last else { return };
+        let mut announce = Announce::new(last.boot, &self.name, &self.kind);
+        for topic in self.streams.iter().filter(|stream| stream.every.is_some()).map(|stream| stream.topic) {
             announce.add(Announced {
                 topic: topic.number(),
                 group: group(topic),
                 port: PORT,
-                next: numbering.next(heard.sensor, topic),
+                next: writer.next(last.sensor, topic),
             });
-            if numbering.tells_replaced() {
-                announce.add_replaced(numbering.replaced(heard.sensor, topic));
+            if writer.counts_replaced() {
+                announce.add_replaced(writer.replaced(last.sensor, topic));
             }
         }
         let head = Head {
             topic: Announce::NUMBER,
-            flags: flags(&heard) & !LanFlags::SUSPECT,
+            flags: flags(&last) & !LanFlags::SUSPECT,
             revision: announce.revision(),
-            ..head(Topic::Status, &heard, now.wall_ns)
+            ..head(Topic::Status, &last, now.wall_ns)
         };
-        numbering.send(head, to, |room| announce.pack(room));
+        writer.send(head, to, |room| announce.pack(room));
     }
 
-    /// Sends `sample`, if it is one that goes out.
-    pub(super) fn take(
+    /// Sends `sample`, unless it is thinned out, is a known background or comes from another machine.
+    pub(super) fn send(
         &mut self,
         sample: &Sample<'_>,
         now: Stamp,
-        numbering: &mut Numbering,
+        writer: &mut DatagramWriter,
         to: &mut impl Transmit,
     ) {
         let topic = sample.payload.topic();
-        let Sensor { name, tracks, heard, kind, .. } = self;
-        let track = &mut tracks[topic as usize];
+        let Sensor { name, streams, last, kind, .. } = self;
+        let stream = &mut streams[topic as usize];
         let Some(header) = sample.header.copied() else {
-            // A silence has no header of its own: it is one of the last sample's sensor, if that still is this one.
-            let last = track.last.filter(|last| numbering.is_claimed(last.sensor, name));
-            if let Some(last) = last.filter(|_| track.every.is_some()) {
-                track.is_unknown = true;
-                numbering.send(head(topic, &last, now.wall_ns), to, |room| sample.payload.pack(room));
+            // A silence has no header of its own. It gets that of the last sample, if its number still belongs to this sensor.
+            let last = stream.last.filter(|last| writer.is_claimed(last.sensor, name));
+            if let Some(last) = last.filter(|_| stream.every.is_some()) {
+                stream.is_unknown = true;
+                writer.send(head(topic, &last, now.wall_ns), to, |room| sample.payload.pack(room));
             }
             return;
         };
-        // What came from another machine is not sent on: it would go round in circles.
+        // Samples of another machine are not forwarded, because they would circulate between machines.
         if header.flags & Flags::REMOTE != 0 {
             return;
         }
-        let is_new = heard.is_none_or(|heard| (heard.boot, heard.sensor) != (header.boot, header.sensor));
+        let is_new = last.is_none_or(|last| (last.boot, last.sensor) != (header.boot, header.sensor));
         if is_new {
-            numbering.claim(header.sensor, name);
-        } else if !numbering.is_claimed(header.sensor, name) {
-            // What is left of a hub's life that is over: the number is another sensor's.
+            writer.claim(header.sensor, name);
+        } else if !writer.is_claimed(header.sensor, name) {
+            // The sample comes from an earlier run of the hub, and its number belongs to another sensor now.
             return;
         }
-        *heard = Some(header);
-        track.last = Some(header);
+        *last = Some(header);
+        stream.last = Some(header);
         if let PayloadRef::Status(status) = sample.payload {
             status.sensor_type().clone_into(kind);
         }
-        // Before its first sample: listeners would take that for one of whoever had the number before.
+        // Announce first. Listeners would otherwise assign the sample to the sensor that had the number before.
         if is_new {
-            self.announce(now, numbering, to);
+            self.announce(now, writer, to);
         }
-        let Sensor { tracks, model, turns, .. } = self;
+        let Sensor { streams, sent_background, revolutions, .. } = self;
         if is_new {
-            *turns = Turns::default();
+            *revolutions = RevolutionCounter::default();
         }
-        let track = &mut tracks[topic as usize];
-        let Some(every) = track.every else { return };
-        numbering.miss(header.sensor, topic, sample.missed);
+        let stream = &mut streams[topic as usize];
+        let Some(every) = stream.every else { return };
+        writer.count_missed(header.sensor, topic, sample.missed);
         let mut stamp_ns = header.wall_ns;
-        let number = match topic {
+        let index = match topic {
             _ if topic == Topic::Telegram || header.family == Family::Lms as u8 => Some(header.seq),
-            Topic::Early => Some(turns.next()),
-            _ => turns.number(&header),
+            Topic::Early => Some(revolutions.next_index()),
+            _ => revolutions.index(&header),
         };
-        let mut is_due = every.get() == 1 || number.is_some_and(|number| number.is_multiple_of(every.get()));
+        let mut is_due = every.get() == 1 || index.is_some_and(|index| index.is_multiple_of(every.get()));
         match sample.payload {
             PayloadRef::Status(_) => stamp_ns = now.wall_ns,
             PayloadRef::Zones(zones) => {
-                // That nothing is known is never thinned away.
+                // A change to unknown is never thinned out.
                 let is_unknown = zones.verdict() == Verdict::Unknown;
-                is_due |= is_unknown && !track.is_unknown;
-                track.is_unknown = if is_due { is_unknown } else { track.is_unknown };
+                is_due |= is_unknown && !stream.is_unknown;
+                stream.is_unknown = if is_due { is_unknown } else { stream.is_unknown };
             }
             PayloadRef::Background(background) => {
-                let same = |model: &Model| {
-                    (model.header.boot, model.background.generation) == (header.boot, background.generation)
+                let is_same = |sent: &SentBackground| {
+                    (sent.header.boot, sent.background.generation) == (header.boot, background.generation)
                 };
-                is_due = !model.as_ref().is_some_and(same);
-                let sent_ns =
-                    model.as_ref().filter(|_| !is_due).map_or(now.monotonic_ns, |model| model.sent_ns);
-                *model = Some(Model { background: background.boxed(), header, sent_ns });
+                is_due = !sent_background.as_ref().is_some_and(is_same);
+                let before = sent_background.as_ref().filter(|_| !is_due);
+                let sent_ns = before.map_or(now.monotonic_ns, |sent| sent.sent_ns);
+                *sent_background = Some(SentBackground { background: background.boxed(), header, sent_ns });
             }
             _ => {}
         }
         if is_due {
-            numbering.send(head(topic, &header, stamp_ns), to, |room| sample.payload.pack(room));
+            writer.send(head(topic, &header, stamp_ns), to, |room| sample.payload.pack(room));
         }
     }
 }
 
-/// No topic is behind another one by more turns than its consumers have places for.
-const REMEMBERED: usize = 64;
+/// Number of revolutions that are kept. A topic never lags another one by more, because its buffer holds fewer samples.
+const MAX_REVOLUTIONS: usize = 64;
 
-/// What stands before a sample of `topic`.
+/// Returns the header of a datagram with a sample of `topic`, without hub, epoch and sequence number.
 fn head(topic: Topic, header: &Header, stamp_ns: u64) -> Head {
     Head {
         topic: topic.number(),
@@ -237,7 +235,7 @@ fn flags(header: &Header) -> u8 {
     header.flags & known | suspect
 }
 
-// The bits are the same in both forms.
+// The bits are the same in a header of shared memory and in a datagram.
 const _: () = assert!(
     Flags::SIMULATED == LanFlags::SIMULATED
         && Flags::REPLAYED == LanFlags::REPLAYED

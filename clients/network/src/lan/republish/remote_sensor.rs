@@ -4,8 +4,9 @@ use scanhub_schema::datagram::{Announce, Head, MTU_ETHERNET, Packed};
 use scanhub_schema::{Failure, Header, State, Status, Topic, Wake, Zones};
 
 use super::SensorTopics;
+use crate::lan::Stamp;
+use crate::lan::gateways::{Arrival, Standing};
 use crate::lan::incoming::{CheckedPayload, Remote};
-use crate::lan::{Arrival, Stamp, Standing};
 
 /// A sensor of another machine.
 pub(super) struct RemoteSensor<T: SensorTopics> {
