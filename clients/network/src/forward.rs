@@ -7,11 +7,9 @@ use std::io::Write;
 use std::num::NonZeroU64;
 use std::time::{Duration, Instant};
 
-use crate::lan::outgoing::{self, Outgoing, PayloadRef, Row};
 use scanhub_client::streams::{GRACE, Sample, Session, Source};
 use scanhub_schema::{Failure, Topic, check_sensor};
 use scanhub_shm::Domain;
-
 use scanhub_verbs::discovery::Discovery;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::no_sensor;
@@ -19,6 +17,7 @@ use scanhub_verbs::output::{End, Output};
 use serde::Serialize;
 
 use crate::gateway_identity::Life;
+use crate::lan::outgoing::{self, Outgoing, PayloadRef, Row};
 pub use selection::Selection;
 
 /// A network that takes samples.

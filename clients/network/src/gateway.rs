@@ -1,10 +1,10 @@
-//! `scanhub gateway`: sends what the hub publishes as datagrams to a network, one sample each. It is an ordinary client that
-//! outlives the hub, its links and its own network, and it receives nothing from the network.
+//! `scanhub gateway`: sends the hub's samples to a network as datagrams. It is an ordinary client, which continues when the hub,
+//! its links or the network fail and come back. It receives nothing from the network.
 
 mod host;
+mod interface_monitor;
 mod network;
 mod udp_destination;
-mod uplink;
 
 use std::collections::BTreeMap;
 use std::io::{self, IsTerminal, Write};
@@ -29,9 +29,9 @@ use crate::gateway_identity::begin_life;
 use crate::lan::Key;
 use crate::lan::outgoing::{ANNOUNCE_EVERY, Form};
 use crate::{VerbOptions, key_file, now};
+use interface_monitor::InterfaceMonitor;
 use network::{Groups, Network};
-use udp_destination::{News, UdpDestination};
-use uplink::Uplink;
+use udp_destination::{DestinationEvent, UdpDestination};
 
 /// Arguments of `scanhub gateway`. Those that are missing may come from section `gateway` of the configuration.
 #[derive(Args, Clone, Debug, Default)]
@@ -45,7 +45,7 @@ pub struct GatewayArgs {
     /// all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     pub topics: Vec<String>,
-    // Help for people, in which brackets are no link.
+    // In help texts, brackets are not links.
     #[allow(rustdoc::broken_intra_doc_links)]
     /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be repeated
     #[arg(long, value_name = "HOST:PORT")]
@@ -135,31 +135,32 @@ enum Display {
     Terminal,
 }
 
+/// A running gateway.
 struct Gateway<'a> {
     args: &'a GatewayArgs,
-    /// Of its key, if there is one.
+    /// Name of its key, if it has one.
     key_name: Option<String>,
     forwarder: Forwarder,
     network: Network,
     tick_at: Instant,
 }
 
-/// In the place of an interface, in the name of the file that keeps a gateway's number: it sends to no group.
+/// Word in place of an interface in the name of the file with the gateway's number, if it sends only to hosts.
 const HOSTS: &str = "hosts";
 
-/// Between two lines of the account, which come with the announcements.
-const TICK: Duration = ANNOUNCE_EVERY;
+/// Interval between announcements, and between reports of the counters.
+const TICK_INTERVAL: Duration = ANNOUNCE_EVERY;
 
 impl<'a> Gateway<'a> {
     fn open(args: &'a GatewayArgs, places: &[Domain], stop: &AtomicBool) -> Result<Gateway<'a>, Failure> {
         let selection = args.selection()?;
         if args.interface.is_none() && args.to.is_empty() {
-            return Err(uplink::nowhere());
+            return Err(interface_monitor::no_destination());
         }
         let key = args.key_file.as_deref().map(key_file::read).transpose()?;
-        let interface = args.interface.as_deref().map(Uplink::open).transpose()?;
+        let interface = args.interface.as_deref().map(InterfaceMonitor::open).transpose()?;
         let domain = places.first().map(Domain::name).unwrap_or_default();
-        let life = begin_life(domain, interface.as_ref().map_or(HOSTS, Uplink::name))?;
+        let life = begin_life(domain, interface.as_ref().map_or(HOSTS, InterfaceMonitor::name))?;
         let key_name = key.as_ref().map(Key::name);
         let form = match key {
             Some(key) => Form::Authenticated(key),
@@ -177,18 +178,18 @@ impl<'a> Gateway<'a> {
         if self.network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
             report.interface(&self.network)?;
         }
-        let end = self.go_on(report, tell, stop);
-        // However it ends: how many were sent is the last word.
+        let end = self.forward(report, tell, stop);
+        // The last announcement contains the final numbers, so that listeners can count lost samples.
         self.announce();
         end.and_then(|()| report.account(&self.network))
     }
 
-    fn go_on(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+    fn forward(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         while !stop.load(Ordering::Relaxed) {
-            if self.network.destinations.look() {
+            if self.network.destinations.update() {
                 report.interface(&self.network)?;
             }
-            // What is there comes before the question whether the hub still is: that takes longer than sending.
+            // Send waiting samples before checking the hub, which takes longer.
             let more = self.forwarder.forward(&mut self.network)?;
             let now = Instant::now();
             self.forwarder.look(now, &mut self.network, &mut |notice| report.hub(notice))?;
@@ -203,12 +204,12 @@ impl<'a> Gateway<'a> {
         Ok(())
     }
 
-    /// Once a second: announcements, backgrounds, and what became of destinations.
+    /// Does the periodic work once a second: announcements, backgrounds, and reports about destinations.
     fn tick(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
         if now < self.tick_at {
             return Ok(());
         }
-        self.tick_at = now + TICK;
+        self.tick_at = now + TICK_INTERVAL;
         if let Some(every) = self.args.background_every {
             let Network { outgoing, destinations, .. } = &mut self.network;
             outgoing.repeat(every, crate::now(), destinations);
@@ -218,8 +219,8 @@ impl<'a> Gateway<'a> {
             if let Some(address) = destination.follow_name(now) {
                 report.moved(&destination.name, address)?;
             }
-            if let Some(news) = destination.news() {
-                report.destination(&destination.name, &news)?;
+            if let Some(event) = destination.check() {
+                report.destination(&destination.name, &event)?;
             }
         }
         if let Some(what) = self.network.outgoing.misfit() {
@@ -234,9 +235,9 @@ impl<'a> Gateway<'a> {
     }
 }
 
-/// Where it is told.
+/// Output of a gateway.
 struct Report<'a> {
-    look: Display,
+    display: Display,
     out: Output<'a>,
     notes: Output<'a>,
     /// Datagrams to the first destination, as of the last status line.
@@ -244,15 +245,15 @@ struct Report<'a> {
 }
 
 impl<'a> Report<'a> {
-    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
-    fn new(look: Display, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
-        Report { look, out: Output::new(out), notes: Output::new(notes), sent: 0 }
+    /// Creates the output: counters to `out`, and everything else to `notes` if `out` is not JSON.
+    fn new(display: Display, out: &'a mut dyn Write, notes: &'a mut dyn Write) -> Report<'a> {
+        Report { display, out: Output::new(out), notes: Output::new(notes), sent: 0 }
     }
 
-    /// Who it is, where it sends, and of which key datagrams have a MAC.
+    /// Reports the gateway's identity, its destinations and its key.
     fn begin(&mut self, network: &Network, bare: bool, key: Option<&str>) -> Result<(), End> {
         let to: Vec<_> = network.destinations.copies.iter().map(|copy| copy.name.as_str()).collect();
-        if self.look == Display::Json {
+        if self.display == Display::Json {
             return self.out.json(&Begin {
                 class: "gateway",
                 hub: id(network),
@@ -283,13 +284,13 @@ impl<'a> Report<'a> {
         Ok(())
     }
 
-    /// News of the hub.
+    /// Reports a notice about the hub.
     fn hub(&mut self, notice: Notice) -> Result<(), End> {
-        self.wipe()?;
-        forward::tell(notice, self.look == Display::Json, &mut self.out, &mut self.notes)
+        self.clear_line()?;
+        forward::tell(notice, self.display == Display::Json, &mut self.out, &mut self.notes)
     }
 
-    /// The state of the interface became another one.
+    /// Reports a new state of the interface.
     fn interface(&mut self, network: &Network) -> Result<(), End> {
         let Some(Groups { interface, .. }) = &network.destinations.groups else { return Ok(()) };
         match interface.is_up() {
@@ -298,41 +299,41 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// What became of a destination.
-    fn destination(&mut self, destination: &str, news: &News) -> Result<(), End> {
-        match news {
-            News::Failing(why) => self.link(destination, "failing", Some(why)),
-            News::Well => self.link(destination, "well", None),
+    /// Reports a state change of a destination.
+    fn destination(&mut self, destination: &str, event: &DestinationEvent) -> Result<(), End> {
+        match event {
+            DestinationEvent::Failing(why) => self.link(destination, "failing", Some(why)),
+            DestinationEvent::Well => self.link(destination, "well", None),
         }
     }
 
-    /// The name of a destination has another address now, which is sent to.
+    /// Reports the new address of a destination.
     fn moved(&mut self, destination: &str, address: SocketAddr) -> Result<(), End> {
         self.link(destination, "moved", Some(&format!("its address is now {address}")))
     }
 
-    /// Samples of `topic` are longer than the longest datagram.
+    /// Reports that samples of `topic` do not fit into the maximum number of datagrams.
     fn misfit(&mut self, topic: &str, longest: usize) -> Result<(), End> {
         let message =
             format!("does not fit into {longest} bytes: --mtu, or the interface's own, is too small");
         self.link(topic, "failing", Some(&message))
     }
 
-    /// The periodic word: an object for each sensor and topic and each destination, or one line on a terminal.
-    fn periodic(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
-        match self.look {
+    /// Prints the periodic report: JSON lines with all counters, or a status line on a terminal.
+    fn periodic(&mut self, network: &Network, is_hub_running: bool) -> Result<(), End> {
+        match self.display {
             Display::Json => self.account(network),
             Display::Lines => Ok(()),
-            Display::Terminal => self.draw(network, hub_lives),
+            Display::Terminal => self.draw(network, is_hub_running),
         }
     }
 
-    /// The whole account.
+    /// Prints all counters.
     fn account(&mut self, network: &Network) -> Result<(), End> {
-        self.wipe()?;
-        let json = self.look == Display::Json;
+        self.clear_line()?;
+        let json = self.display == Display::Json;
         forward::account(&network.outgoing, &network.life, "lan", json, &mut self.out)?;
-        if network.outgoing.unfit() > 0 && self.look != Display::Json {
+        if network.outgoing.unfit() > 0 && self.display != Display::Json {
             let longest = network.outgoing.longest();
             self.out.line(|line| {
                 write!(line, "too long for {longest} bytes: {}, see --mtu", network.outgoing.unfit())
@@ -343,7 +344,7 @@ impl<'a> Report<'a> {
 
     fn write_destination(&mut self, network: &Network, destination: &UdpDestination) -> Result<(), End> {
         let UdpDestination { name, sent, failed, reported, .. } = destination;
-        if self.look == Display::Json {
+        if self.display == Display::Json {
             return self.out.json(&To {
                 class: "lan_to",
                 hub: id(network),
@@ -358,37 +359,45 @@ impl<'a> Report<'a> {
     }
 
     fn link(&mut self, to: &str, state: &'static str, message: Option<&str>) -> Result<(), End> {
-        if self.look == Display::Json {
+        if self.display == Display::Json {
             return self.out.json(&Link { class: "lan_link", to, state, message });
         }
-        self.wipe()?;
+        self.clear_line()?;
         self.notes.line(|line| match message {
             Some(message) => write!(line, "{to}: {state}: {message}"),
             None => write!(line, "{to}: {state}"),
         })
     }
 
-    fn draw(&mut self, network: &Network, hub_lives: bool) -> Result<(), End> {
-        // A line that wraps would not be drawn over: it is cut.
-        let mut line = [WIPE, b"\x1b[?7l"].concat();
-        status(&mut line, network, hub_lives, self.sent)?;
+    /// Draws the status line over the previous one.
+    fn draw(&mut self, network: &Network, is_hub_running: bool) -> Result<(), End> {
+        // Disable wrapping, because a wrapped line could not be drawn over.
+        let mut line = [CLEAR_LINE, b"\x1b[?7l"].concat();
+        write_status(&mut line, network, is_hub_running, self.sent)?;
         line.extend(b"\x1b[?7h");
         self.sent = first(network).0;
         self.out.raw(&line)
     }
 
-    fn wipe(&mut self) -> Result<(), End> {
-        match self.look {
-            Display::Terminal => self.out.raw(WIPE),
+    /// Clears the status line, if there is one.
+    fn clear_line(&mut self) -> Result<(), End> {
+        match self.display {
+            Display::Terminal => self.out.raw(CLEAR_LINE),
             Display::Json | Display::Lines => Ok(()),
         }
     }
 }
 
-fn status(line: &mut Vec<u8>, network: &Network, hub_lives: bool, sent_before: u64) -> io::Result<()> {
+/// Writes the status line. The rate is the number of datagrams since `sent_before`.
+fn write_status(
+    line: &mut Vec<u8>,
+    network: &Network,
+    is_hub_running: bool,
+    sent_before: u64,
+) -> io::Result<()> {
     let is_down = network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up());
     let state = if is_down { " down" } else { "" };
-    let hub = if hub_lives { "" } else { "no hub, " };
+    let hub = if is_hub_running { "" } else { "no hub, " };
     let (sent, name) = first(network);
     write!(line, "{hub}{name}{state}: {}/s", sent - sent_before)?;
     for (number, destination) in network.destinations.all().enumerate() {
@@ -413,11 +422,12 @@ fn status(line: &mut Vec<u8>, network: &Network, hub_lives: bool, sent_before: u
     }
 }
 
-/// How many datagrams went to the first destination, which there always is, and its name.
+/// Returns the number of datagrams to the first destination, which always exists, and its name.
 fn first(network: &Network) -> (u64, &str) {
     network.destinations.all().next().map_or((0, ""), |destination| (destination.sent, &destination.name))
 }
 
+/// Returns the gateway's number as in all output.
 fn id(network: &Network) -> String {
     format!("{:016x}", network.life.hub)
 }
@@ -457,12 +467,12 @@ struct Link<'a> {
     message: Option<&'a str>,
 }
 
-/// Why a gateway has another number than is kept.
+/// Reason for which a gateway has another number than the stored one.
 const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
-/// What a gateway without a key says once.
+/// Note of a gateway without a key.
 const NO_KEY: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
-/// To the line's begin, and nothing on it (ECMA-48).
-const WIPE: &[u8] = b"\r\x1b[K";
+/// Moves the cursor to the start of the line, and clears it (ECMA-48).
+const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 
 /// Returns the groups and their topics, for the end of the help.
 pub fn groups_help() -> String {
@@ -473,7 +483,7 @@ pub fn groups_help() -> String {
     text + "bare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\nSIGUSR1: print the counts so far"
 }
 
-/// The address of each multicast group, and the names of the topics that are sent to it.
+/// Returns the address of each multicast group, and the names of the topics that are sent to it.
 fn groups_and_topics() -> Vec<(String, String)> {
     let mut groups = BTreeMap::from([(Announce::GROUP, vec!["announce"])]);
     for topic in Topic::ALL {
@@ -488,7 +498,7 @@ fn groups_and_topics() -> Vec<(String, String)> {
 mod tests {
     use super::*;
 
-    /// Reads a file of this repository, without line breaks, backquotes and the marks of doc comments.
+    /// Reads a file of this repository, without line breaks, backquotes and comment marks.
     fn words_of(path: &str) -> String {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(path);
         let text = std::fs::read_to_string(path).unwrap().replace(['`'], "").replace("///", "");
@@ -496,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn help_and_pages_name_the_topics_that_are_not_sent_by_default() {
+    fn documentation_lists_topics_that_are_not_sent_by_default() {
         let left_out: Vec<_> =
             Topic::ALL.into_iter().filter(|topic| !Selection::is_default(*topic)).collect();
         let names: Vec<_> = left_out.iter().map(|topic| topic.name()).collect();

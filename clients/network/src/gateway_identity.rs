@@ -21,7 +21,7 @@ pub struct Life {
     pub epoch: u32,
     /// Whether the gateway has a new number, because the kept one belongs to another machine whose disk was copied.
     pub is_renumbered: bool,
-    /// Locked.
+    /// File with the number, which stays locked.
     _file: File,
 }
 
@@ -63,6 +63,7 @@ impl Life {
         Err(Failure::new(Kind::Configuration, what, "stop some of them"))
     }
 
+    /// Begins a run with the number in `file`, or with a new one.
     fn of(file: File, now_s: u64, machine: Option<u64>) -> io::Result<Life> {
         let now = u32::try_from(now_s).unwrap_or(u32::MAX);
         let kept = Kept::read(&file);
@@ -94,6 +95,7 @@ struct Kept {
 }
 
 impl Kept {
+    /// Reads the file. `None` if its content is not valid.
     fn read(file: &File) -> Option<Kept> {
         let mut bytes = [0; 64];
         let len = file.read_at(&mut bytes, 0).ok()?;
@@ -126,7 +128,7 @@ fn directory() -> Result<PathBuf, Failure> {
 /// Maximum number of gateways of one domain on one interface. More are started by mistake.
 const MAX_GATEWAYS: u32 = 16;
 
-/// Begins a run of the gateway of `domain` by this `way`, on this machine and now.
+/// Begins a run of the gateway of `domain` on this machine, now. `way` is its interface, or another word for its destination.
 ///
 /// # Errors
 ///
@@ -177,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn each_life_has_a_greater_epoch() {
+    fn each_run_has_a_higher_epoch() {
         let place = Place::new();
         let (hub, epoch) = {
             let life = place.begin("eth0", 1000);
@@ -191,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn two_at_once_are_two() {
+    fn concurrent_gateways_have_different_numbers() {
         let place = Place::new();
         let first = place.begin("eth0", 1);
         let (second, elsewhere) = (place.begin("eth0", 1), place.begin("wlan0", 1));
@@ -203,21 +205,21 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_on_another_machine_is_another_gateway() {
+    fn copy_on_another_machine_gets_a_new_number() {
         let place = Place::new();
         let of = |life: Life| (life.hub, life.epoch, life.is_renumbered);
-        // Kept before machines were told apart, and where they cannot be.
+        // The number was stored without a machine, by an earlier version or on a machine without an ID.
         let (hub, ..) = of(place.begin("eth0", 7));
         assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 8, false));
         assert_eq!(of(place.begin("eth0", 7)), (hub, 9, false));
         assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 10, false));
         let (copy, epoch, is_renumbered) = of(place.begin_on("eth0", 7, Some(0xb)));
         assert!(copy != hub && epoch == 7 && is_renumbered);
-        assert_eq!(of(place.begin_on("eth0", 7, Some(0xb))), (copy, 8, false), "said once");
+        assert_eq!(of(place.begin_on("eth0", 7, Some(0xb))), (copy, 8, false), "reported once");
     }
 
     #[test]
-    fn what_is_no_number_is_replaced() {
+    fn replaces_invalid_number() {
         let place = Place::new();
         let hub = place.begin("eth0", 7).hub;
         let path = place.0.path().join("gateway-d-eth0-1");
@@ -230,14 +232,14 @@ mod tests {
     }
 
     #[test]
-    fn a_place_that_cannot_be_written_is_refused() {
+    fn refuses_unwritable_directory() {
         let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
         assert_eq!(refused.kind, Kind::Output);
         assert!(refused.message.contains("number: /dev/null: "), "{refused}");
     }
 
     #[test]
-    fn machine_id_is_always_the_same_number() {
+    fn machine_hash_is_stable() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("machine-id");
         let of = |text: &str| {

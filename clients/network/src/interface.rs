@@ -1,37 +1,41 @@
-//! The network interfaces of this machine, for joining groups on them and sending to them. Refuses to know sockets.
-
-mod changes;
+//! Network interfaces of this machine, and the kernel's notifications that they or their addresses have changed
+//! (rtnetlink(7)). The notifications include interfaces that were down only briefly, which polling would miss.
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use nix::ifaddrs::{InterfaceAddress, getifaddrs};
 use nix::net::if_::{InterfaceFlags, if_nametoindex};
+use rustix::io::Errno;
+use rustix::net::netlink::SocketAddrNetlink;
+use rustix::net::{
+    AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, bind, recv, send, socket_with,
+};
 use scanhub_schema::{Failure, Kind};
 
-pub(crate) use changes::Changes;
-
-/// One interface, as it is at this moment.
+/// State of one interface at the time of the query.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Interface {
-    /// Its name.
     pub(crate) name: String,
-    /// Its number: another one if it was taken away and made again under the same name.
+    /// The kernel's index. It changes when the interface is removed and created again under the same name.
     pub(crate) index: u32,
-    /// It is switched on.
+    /// Whether the interface is enabled.
     pub(crate) up: bool,
-    /// There is a link: its cable is plugged in.
+    /// Whether it has a carrier, such as a plugged cable.
     pub(crate) running: bool,
-    /// It can carry groups, or is the loopback, which can all the same.
+    /// Whether it supports multicast. The loopback does, although its flags do not say so.
     pub(crate) multicast: bool,
-    /// It leads back to this machine.
+    /// Whether it leads back to this machine.
     pub(crate) loopback: bool,
-    /// Its first IPv4 address.
+    /// First IPv4 address.
     pub(crate) address: Option<Ipv4Addr>,
 }
 
-/// All interfaces, in the kernel's order.
+/// Returns all interfaces, in the kernel's order.
 ///
-/// [`Kind::Failed`] if the system does not tell.
+/// # Errors
+///
+/// Returns [`Kind::Failed`] if the system cannot list them.
 pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
     let addresses = getifaddrs().map_err(|error| {
         Failure::new(Kind::Failed, format!("cannot list network interfaces: {error}"), "")
@@ -47,9 +51,11 @@ pub(crate) fn interfaces() -> Result<Vec<Interface>, Failure> {
     Ok(found)
 }
 
-/// The interface called `name`.
+/// Returns the interface called `name`.
 ///
-/// [`Kind::Configuration`] with those that there are.
+/// # Errors
+///
+/// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist.
 pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
     let mut all = interfaces()?;
     if let Some(at) = all.iter().position(|interface| interface.name == name) {
@@ -63,16 +69,17 @@ pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
     ))
 }
 
-/// Whether a sender with `address` is on this machine; not if the system does not tell its addresses.
+/// Returns whether a sender with `address` is on this machine. `false` if the system cannot list its addresses.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
     let is_it = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
-    // What goes to a group by the loopback of a machine without another address has none; from outside none such comes in.
+    // A datagram to a group has no source address if it is sent by loopback on a machine without another address. None with
+    // such an address arrives from outside.
     address.is_loopback()
         || address.is_unspecified()
         || getifaddrs().is_ok_and(|mut all| all.any(|entry| is_it(&entry)))
 }
 
-/// Nothing if it was taken away meanwhile.
+/// Returns the interface of `entry`. `None` if it was removed in the meantime.
 fn interface(entry: InterfaceAddress, address: Option<Ipv4Addr>) -> Option<Interface> {
     let index = if_nametoindex(entry.interface_name.as_str()).ok()?;
     let has = |flag| entry.flags.contains(flag);
@@ -92,12 +99,171 @@ fn ipv4(entry: &InterfaceAddress) -> Option<Ipv4Addr> {
     Some(Ipv4Addr::from(entry.address.as_ref()?.as_sockaddr_in()?.ip()))
 }
 
+/// Receiver of notifications that interfaces or addresses have changed.
+pub(crate) struct InterfaceChanges {
+    socket: OwnedFd,
+    buffer: Vec<u8>,
+    losses: CarrierLosses,
+}
+
+/// Interface that lost its carrier, was disabled or removed. It may be up again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum LostInterface {
+    /// The interface with this index.
+    One(u32),
+    /// Any interface, because the queue of notifications overflowed.
+    Any,
+}
+
+/// Maximum length of the kernel's messages, in bytes (Linux, Documentation/userspace-api/netlink/intro.rst).
+const MAX_MESSAGE_LEN: usize = 32 << 10;
+
+impl InterfaceChanges {
+    /// Subscribes to all changes from now on.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if the kernel refuses.
+    pub(crate) fn subscribe() -> Result<InterfaceChanges, Failure> {
+        let socket = open_netlink().map_err(|error| {
+            Failure::new(Kind::Failed, format!("cannot watch network interfaces: {error}"), "")
+        })?;
+        Ok(InterfaceChanges { socket, buffer: vec![0; MAX_MESSAGE_LEN], losses: CarrierLosses::default() })
+    }
+
+    /// Reads all waiting notifications, and calls `on_lost` with each interface that was lost since the last call. Returns
+    /// whether anything has changed. Costs one system call if nothing has.
+    pub(crate) fn read(&mut self, mut on_lost: impl FnMut(LostInterface)) -> bool {
+        let mut any = false;
+        loop {
+            match recv(&self.socket, &mut self.buffer[..], RecvFlags::DONTWAIT) {
+                Ok((len, _)) => self.losses.read(&self.buffer[..len], &mut on_lost),
+                Err(Errno::NOBUFS) => on_lost(LostInterface::Any),
+                Err(Errno::INTR) => continue,
+                Err(_) => return any,
+            }
+            any = true;
+        }
+    }
+}
+
+impl AsFd for InterfaceChanges {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+impl LostInterface {
+    /// Returns whether it may be the interface with this index.
+    pub(crate) fn includes(self, index: u32) -> bool {
+        self == LostInterface::Any || self == LostInterface::One(index)
+    }
+}
+
+/// Opens a nonblocking socket that receives changes of links and addresses, and requests all existing links.
+fn open_netlink() -> rustix::io::Result<OwnedFd> {
+    const LINK: u32 = 1;
+    const IPV4_ADDRESS: u32 = 0x10;
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    // No protocol: NETLINK_ROUTE is 0.
+    let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
+    bind(&socket, &SocketAddrNetlink::new(0, LINK | IPV4_ADDRESS))?;
+    send(&socket, &request_links(), SendFlags::empty())?;
+    Ok(socket)
+}
+
+/// Returns the message that requests all links.
+fn request_links() -> [u8; HEADER + LINK_HEADER] {
+    const REQUEST_DUMP: u16 = 0x301;
+    let mut request = [0; HEADER + LINK_HEADER];
+    request[..4].copy_from_slice(&((HEADER + LINK_HEADER) as u32).to_ne_bytes());
+    request[4..6].copy_from_slice(&GETLINK.to_ne_bytes());
+    request[6..8].copy_from_slice(&REQUEST_DUMP.to_ne_bytes());
+    request
+}
+
+/// Number of times that each interface has lost its carrier. If that happens twice in a second, the kernel reports both losses
+/// at once when the carrier is back, and only this number shows them.
+#[derive(Default)]
+struct CarrierLosses {
+    /// By the interface's index.
+    counts: Vec<(u32, u32)>,
+}
+
+// struct nlmsghdr and struct ifinfomsg.
+const HEADER: usize = 16;
+const LINK_HEADER: usize = 16;
+const NEWLINK: u16 = 16;
+const DELLINK: u16 = 17;
+const GETLINK: u16 = 18;
+const RUNNING: u32 = 0x40;
+/// IFLA_CARRIER_DOWN_COUNT, since Linux 4.16.
+const CARRIER_DOWN_COUNT: u16 = 48;
+
+impl CarrierLosses {
+    /// Reads a datagram of the kernel, and calls `on_lost` with each lost interface.
+    fn read(&mut self, mut bytes: &[u8], on_lost: &mut impl FnMut(LostInterface)) {
+        while let Some((message, rest)) = u32_at(bytes, 0).and_then(|len| cut(bytes, len as usize)) {
+            bytes = rest;
+            let (Some(kind), Some(index)) = (u16_at(message, 4), u32_at(message, HEADER + 4)) else { return };
+            if kind == DELLINK {
+                self.counts.retain(|&(known, _)| known != index);
+                on_lost(LostInterface::One(index));
+            } else if kind == NEWLINK {
+                let is_running = u32_at(message, HEADER + 8).is_some_and(|flags| flags & RUNNING != 0);
+                let is_lost_again = loss_count(message).is_some_and(|count| self.update(index, count));
+                if !is_running || is_lost_again {
+                    on_lost(LostInterface::One(index));
+                }
+            }
+        }
+    }
+
+    /// Records the number of losses of an interface. Returns whether it has changed.
+    fn update(&mut self, index: u32, count: u32) -> bool {
+        match self.counts.iter_mut().find(|(known, _)| *known == index) {
+            Some((_, before)) => std::mem::replace(before, count) != count,
+            None => {
+                self.counts.push((index, count));
+                false
+            }
+        }
+    }
+}
+
+/// Returns the number of losses in `message`.
+fn loss_count(message: &[u8]) -> Option<u32> {
+    let mut attributes = message.get(HEADER + LINK_HEADER..)?;
+    loop {
+        let (attribute, rest) = cut(attributes, u16_at(attributes, 0)?.into())?;
+        if u16_at(attribute, 2) == Some(CARRIER_DOWN_COUNT) {
+            return u32_at(attribute, 4);
+        }
+        attributes = rest;
+    }
+}
+
+/// Returns the first `len` bytes, and the rest, which starts at a multiple of 4. `None` if `bytes` is shorter, or if `len` has no
+/// room for the length itself.
+fn cut(bytes: &[u8], len: usize) -> Option<(&[u8], &[u8])> {
+    let first = bytes.get(..len).filter(|first| first.len() >= 4)?;
+    Some((first, bytes.get(len.next_multiple_of(4)..).unwrap_or_default()))
+}
+
+fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
+    bytes.get(at..)?.first_chunk().map(|bytes| u16::from_ne_bytes(*bytes))
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
+    bytes.get(at..)?.first_chunk().map(|bytes| u32::from_ne_bytes(*bytes))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_loopback_is_known_and_others_are_named() {
+    fn finds_loopback_and_lists_interfaces() {
         let lo = named("lo").unwrap();
         assert!(lo.loopback && lo.multicast && lo.index > 0, "{lo:?}");
         let own = interfaces().unwrap().into_iter().filter_map(|interface| interface.address);
@@ -105,10 +271,72 @@ mod tests {
             own.chain([Ipv4Addr::new(127, 0, 0, 9), Ipv4Addr::UNSPECIFIED])
                 .all(|own| is_of_this_machine(own.into()))
         );
-        // For documentation: nobody has it (RFC 5737).
+        // Reserved for documentation (RFC 5737).
         assert!(!is_of_this_machine(Ipv4Addr::new(192, 0, 2, 1).into()));
         let failure = named("no-such").unwrap_err();
         assert_eq!(failure.kind, Kind::Configuration);
         assert!(failure.message.contains("no-such") && failure.hint.contains("lo"), "{failure}");
+    }
+
+    /// Builds a message of the kernel, with a name before the number of losses.
+    fn message(kind: u16, index: u32, flags: u32, losses: Option<u32>) -> Vec<u8> {
+        let mut body = vec![0; 4];
+        body.extend([index.to_ne_bytes(), flags.to_ne_bytes(), [0xFF; 4]].concat());
+        body.extend([&7_u16.to_ne_bytes(), &3_u16.to_ne_bytes(), &b"lo\0\0"[..]].concat());
+        if let Some(losses) = losses {
+            body.extend(
+                [&8_u16.to_ne_bytes()[..], &CARRIER_DOWN_COUNT.to_ne_bytes(), &losses.to_ne_bytes()].concat(),
+            );
+        }
+        let mut bytes = ((HEADER + body.len()) as u32).to_ne_bytes().to_vec();
+        bytes.extend([&kind.to_ne_bytes()[..], &[0; 10]].concat());
+        bytes.extend(body);
+        bytes
+    }
+
+    fn read(losses: &mut CarrierLosses, bytes: &[u8]) -> Vec<LostInterface> {
+        let mut all = Vec::new();
+        losses.read(bytes, &mut |lost| all.push(lost));
+        all
+    }
+
+    #[test]
+    fn reports_lost_interface_that_is_up_again() {
+        let mut losses = CarrierLosses::default();
+        let of = |index, flags, losses| message(NEWLINK, index, flags, Some(losses));
+        let all = [of(1, RUNNING, 0), of(2, RUNNING, 5), of(3, 0, 1)].concat();
+        assert_eq!(read(&mut losses, &all), [LostInterface::One(3)]);
+        assert_eq!(read(&mut losses, &of(2, RUNNING, 5)), [], "something else has changed");
+        assert_eq!(read(&mut losses, &of(2, RUNNING, 6)), [LostInterface::One(2)]);
+        assert_eq!(read(&mut losses, &of(2, RUNNING, 6)), []);
+        assert_eq!(read(&mut losses, &message(NEWLINK, 1, RUNNING, None)), [], "an old kernel");
+        assert_eq!(read(&mut losses, &message(NEWLINK, 1, 0, None)), [LostInterface::One(1)]);
+        assert_eq!(read(&mut losses, &message(DELLINK, 2, RUNNING, Some(6))), [LostInterface::One(2)]);
+        assert_eq!(read(&mut losses, &of(2, RUNNING, 0)), [], "another interface with the same index");
+        assert!(
+            LostInterface::One(2).includes(2)
+                && !LostInterface::One(2).includes(3)
+                && LostInterface::Any.includes(3)
+        );
+    }
+
+    #[test]
+    fn ignores_truncated_messages() {
+        let whole = message(NEWLINK, 2, 0, Some(1));
+        for len in 0..whole.len() {
+            assert_eq!(read(&mut CarrierLosses::default(), &whole[..len]), [], "{len}");
+        }
+        assert_eq!(
+            read(&mut CarrierLosses::default(), &3_u32.to_ne_bytes()),
+            [],
+            "shorter than its own length"
+        );
+    }
+
+    #[test]
+    fn kernel_lists_existing_links() {
+        let mut changes = InterfaceChanges::subscribe().unwrap();
+        // The kernel responds within the request.
+        assert!(changes.read(|_| {}) && changes.losses.counts.iter().any(|&(index, _)| index > 0));
     }
 }

@@ -5,15 +5,15 @@ use std::io::Write;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::lan::Key;
 use clap::{Args, Subcommand};
 use rustix::rand::{GetRandomFlags, getrandom};
 use scanhub_files::output::{PRIVATE, Target, unwritable};
 use scanhub_files::regular;
 use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::output::{Output, quiet};
 use serde_json::json;
 
-use scanhub_verbs::output::{Output, quiet};
+use crate::lan::Key;
 
 /// Arguments of `scanhub key`.
 #[derive(Args, Debug)]
@@ -80,7 +80,7 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
 ///
 /// # Errors
 ///
-/// [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to another user, can
+/// Returns [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to another user, can
 /// be read or written by others, or contains no key.
 pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     let refuse = |what: String, hint: &str| {
@@ -101,7 +101,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
         let what = format!("its mode is {mode:04o}, so others can use the key");
         return Err(refuse(what, "`chmod 600` it; if others may have read it, make a new one"));
     }
-    let bytes = regular::read_all(&mut file, LONGEST).map_err(unreadable)?;
+    let bytes = regular::read_all(&mut file, MAX_FILE_LEN).map_err(unreadable)?;
     let key = parse(&bytes).ok_or_else(|| {
         refuse(
             format!("its {} bytes are no key", about.len()),
@@ -111,6 +111,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     Ok(Key::new(&key))
 }
 
+/// Returns the key in the content of a file.
 fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
     if let Ok(raw) = bytes.try_into() {
         return Some(raw);
@@ -121,17 +122,17 @@ fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
     pairs.iter().map(byte).collect::<Option<Vec<u8>>>().filter(|_| is_hex)?.try_into().ok()
 }
 
-/// Remedy for a file that is not replaced.
+/// Hint for a file that exists.
 const KEY_EXISTS: &str = "name another file, or remove this one if no gateway uses its key any more";
-/// More than any form of a key has.
-const LONGEST: u64 = 256;
+/// Maximum number of bytes that are read, more than any form of a key has.
+const MAX_FILE_LEN: u64 = 256;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_key_is_32_bytes_or_64_digits() {
+    fn parses_32_bytes_or_64_digits() {
         let hex = "00ff".repeat(16);
         let bytes = std::array::from_fn(|at| if at % 2 == 0 { 0 } else { 0xff });
         assert_eq!(parse(hex.as_bytes()), Some(bytes));

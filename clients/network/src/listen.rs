@@ -1,15 +1,17 @@
 //! `scanhub listen`: receives what gateways send, and prints or publishes it with counters of what did not arrive.
 //!
-//! The path of a datagram, from top to bottom:
+//! With `--publish`, a datagram takes this path. Each step calls the next one, from `Listener::receive_batch` on:
 //!
-//! 1. The socket ([`MulticastReceiver::receive`]) returns its bytes, sender and time of arrival.
-//! 2. The header: [`Incoming::receive`](crate::lan::incoming::Incoming::receive) checks the lengths and the checksum, whether
-//!    the gateway was selected by `--hub`, and the MAC if there is a key.
-//! 3. Parts: the sample is complete with the last of them.
-//! 4. The gateway: [`GatewayTable`](crate::lan::GatewayTable) checks the run, the sender, the sequence number and the payload,
-//!    and counts the sample.
-//! 5. The sample: [`Reception::take`] prints it, or passes it on.
-//! 6. The publisher: [`Republisher`](crate::lan::republish::Republisher) copies it into the topic of its sensor.
+//! | step | code | work |
+//! |---|---|---|
+//! | socket | [`MulticastReceiver::receive`] | returns the bytes, the sender and the time of arrival |
+//! | header | [`Incoming::receive_named`](crate::lan::incoming::Incoming::receive_named) | checks length, checksum, `--hub` and the MAC |
+//! | parts | `Incoming::complete` | continues with the last part of a sample |
+//! | gateway | `GatewayTable::take` | checks run, sender, sequence number and payload, and counts the sample |
+//! | sample | `Reception::on_sample` | prints the sample, or passes it on |
+//! | publisher | [`Republisher::sample`](crate::lan::republish::Republisher::sample) | copies it into the topic of its sensor |
+//!
+//! Subscribers are woken after each batch.
 
 mod multicast_receiver;
 
@@ -28,8 +30,7 @@ use scanhub_shm::{Domain, StateDirectory};
 use scanhub_verbs::follow::Bounds;
 use scanhub_verbs::output::{End, Output, quiet};
 
-use self::multicast_receiver::{LONGEST, MulticastReceiver};
-use crate::lan::Stamp;
+use self::multicast_receiver::{MAX_DATAGRAM_LEN, MulticastReceiver};
 use crate::reception::{Origin, Reception, Wanted, Words};
 use crate::{VerbOptions, key_file};
 
@@ -126,6 +127,7 @@ impl ListenArgs {
     }
 }
 
+/// A running listener.
 struct Listener<'a> {
     args: &'a ListenArgs,
     publish: Option<Domain>,
@@ -137,7 +139,7 @@ struct Listener<'a> {
     draw_at: Instant,
 }
 
-/// Datagrams that are handled before everything else has its turn, so that a flood cannot keep the listener from ending.
+/// Maximum number of datagrams that are handled before all other work, so that the listener can end during a flood.
 const BATCH_SIZE: usize = 64;
 
 /// Maximum sleep, after which interfaces and reasons to stop are checked.
@@ -147,6 +149,7 @@ const MAX_SLEEP: Duration = Duration::from_millis(100);
 const DRAW_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
+    /// Runs the listener, with its first and last output.
     fn listen(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
         self.reception.report.ready(&self.receiver.interfaces(), self.publish.as_ref())?;
         self.reception.begin()?;
@@ -157,45 +160,46 @@ impl Listener<'_> {
         end
     }
 
+    /// Receives until the bounds are reached or `stop` is set.
     fn run(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        let mut buffer = vec![0; LONGEST];
+        let mut buffer = vec![0; MAX_DATAGRAM_LEN];
         loop {
-            let more = self.take(&mut buffer)?;
+            let may_have_more = self.receive_batch(&mut buffer)?;
             self.reception.wake();
             let (now, bounds) = (Instant::now(), &self.args.bounds);
             if self.has_enough() {
                 return Ok(());
             }
             if stop.load(Ordering::Relaxed) {
-                return self.stopped();
+                return self.end_of_stop();
             }
             if bounds.run_for.is_some_and(|limit| now - self.started >= limit) {
-                return self.time_is_over();
+                return self.end_of_time();
             }
             if let Some(limit) = bounds.timeout.filter(|&limit| now - self.reception.last_sample >= limit) {
-                return Err(nothing_came(limit).into());
+                return Err(nothing_arrived(limit).into());
             }
-            self.look(now, more)?;
+            self.do_periodic_work(now, may_have_more)?;
             if tell.swap(false, Ordering::Relaxed) {
                 self.reception.tell(&[])?;
             }
-            if !more {
-                self.receiver.wait(self.left(now));
+            if !may_have_more {
+                self.receiver.wait(self.time_to_sleep(now));
             }
         }
     }
 
-    /// Handles the waiting datagrams, up to a batch. Returns whether there may be more.
-    fn take(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
+    /// Handles waiting datagrams, up to a batch. Returns whether there may be more.
+    fn receive_batch(&mut self, buffer: &mut [u8]) -> Result<bool, End> {
         for _ in 0..BATCH_SIZE {
-            let Some(caught) = self.receiver.receive(buffer)? else { return Ok(false) };
+            let Some(datagram) = self.receiver.receive(buffer)? else { return Ok(false) };
             let origin = Origin {
-                sender: sender(caught.from),
-                address: Some((*caught.from.ip()).into()),
+                sender: sender_id(datagram.from),
+                address: Some((*datagram.from.ip()).into()),
                 name: None,
-                arrival: Stamp { monotonic_ns: caught.arrival_ns, wall_ns: caught.wall_ns },
+                arrival: datagram.arrival,
             };
-            self.reception.take(caught.bytes, origin)?;
+            self.reception.take(datagram.bytes, origin)?;
             if self.has_enough() {
                 return Ok(true);
             }
@@ -203,17 +207,18 @@ impl Listener<'_> {
         Ok(true)
     }
 
+    /// Returns whether the requested number of samples has arrived.
     fn has_enough(&self) -> bool {
         self.args.bounds.count.is_some_and(|count| self.reception.received >= count)
     }
 
-    /// Does what is due regularly. `more` says whether datagrams may be waiting.
-    fn look(&mut self, now: Instant, more: bool) -> Result<(), End> {
-        self.receiver.look(now);
-        if let Some(what) = self.receiver.take_trouble() {
+    /// Does what is due at `now`: interfaces, silent sensors, reports and the drawn counters.
+    fn do_periodic_work(&mut self, now: Instant, may_have_more: bool) -> Result<(), End> {
+        self.receiver.update_interfaces(now);
+        if let Some(what) = self.receiver.take_problem() {
             self.reception.trouble(&what)?;
         }
-        self.reception.look(now, more)?;
+        self.reception.look(now, may_have_more)?;
         if self.is_drawn && now >= self.draw_at {
             self.draw_at = now + DRAW_INTERVAL;
             self.reception.draw()?;
@@ -221,7 +226,8 @@ impl Listener<'_> {
         Ok(())
     }
 
-    fn left(&self, now: Instant) -> Duration {
+    /// Returns the time until a bound is reached, at most [`MAX_SLEEP`].
+    fn time_to_sleep(&self, now: Instant) -> Duration {
         let bounds = &self.args.bounds;
         let end = bounds.run_for.and_then(|limit| self.started.checked_add(limit));
         let silence = bounds.timeout.and_then(|limit| self.reception.last_sample.checked_add(limit));
@@ -229,34 +235,37 @@ impl Listener<'_> {
         first.map_or(MAX_SLEEP, |at| at.saturating_duration_since(now).min(MAX_SLEEP))
     }
 
-    fn stopped(&self) -> Result<(), End> {
+    /// Returns the result of a run that `stop` has ended.
+    fn end_of_stop(&self) -> Result<(), End> {
         if self.args.bounds.bounded() {
             return Err(Failure::new(Kind::Interrupted, "interrupted before it was done", "").into());
         }
         Ok(())
     }
 
-    fn time_is_over(&self) -> Result<(), End> {
+    /// Returns the result of a run whose time has elapsed.
+    fn end_of_time(&self) -> Result<(), End> {
         match self.args.bounds.count {
             Some(count) => {
                 let what = format!("{} of {count} samples arrived in time", self.reception.received);
-                Err(Failure::new(Kind::Timeout, what, NOTHING_CAME).into())
+                Err(Failure::new(Kind::Timeout, what, NOTHING_ARRIVED).into())
             }
             None => Ok(()),
         }
     }
 }
 
-/// Returns the number of a sender, by which gateways are distinguished.
-fn sender(from: SocketAddrV4) -> u64 {
+/// Returns a number that identifies a sender, by which gateways are distinguished.
+fn sender_id(from: SocketAddrV4) -> u64 {
     u64::from(from.ip().to_bits()) << 16 | u64::from(from.port())
 }
 
-fn nothing_came(limit: Duration) -> Failure {
-    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_CAME)
+fn nothing_arrived(limit: Duration) -> Failure {
+    Failure::new(Kind::Timeout, format!("nothing arrived for {limit:?}"), NOTHING_ARRIVED)
 }
 
-const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
+/// Hint for a timeout.
+const NOTHING_ARRIVED: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
                             refused, --interface names another interface";
 
 /// Returns the topics with these names, or all if there are none.

@@ -72,7 +72,8 @@ pub struct Origin<'a> {
 /// Receiving end of a network.
 pub struct Reception<'a> {
     topics: Vec<Topic>,
-    is_quiet: bool,
+    /// Whether only the counters are printed.
+    is_stats: bool,
     publication: Option<Publication>,
     /// Problems that were reported.
     reported: Vec<String>,
@@ -82,7 +83,7 @@ pub struct Reception<'a> {
     capacity: CapacityReporter,
     pub(crate) report: Report<'a>,
     /// Time of arrival of the last datagram.
-    taken: Stamp,
+    last_arrival: Stamp,
     /// Samples that were received.
     pub received: u64,
     /// Time of the last one.
@@ -143,14 +144,14 @@ impl<'a> Reception<'a> {
         };
         Ok(Reception {
             topics: wanted.topics,
-            is_quiet: wanted.stats,
+            is_stats: wanted.stats,
             publication,
             reported: Vec::new(),
             incoming: incoming.only(hubs),
             epochs,
             capacity: CapacityReporter::default(),
             report: Report::new(json, words, out, notes, names, key_name),
-            taken: Stamp::default(),
+            last_arrival: Stamp::default(),
             received: 0,
             last_sample: Instant::now(),
             foreign: 0,
@@ -174,11 +175,11 @@ impl<'a> Reception<'a> {
     ///
     /// Returns the reason why output cannot be written.
     pub fn take(&mut self, bytes: &[u8], origin: Origin<'_>) -> Result<(), End> {
-        self.taken = origin.arrival;
+        self.last_arrival = origin.arrival;
         let mut whole = std::mem::take(&mut self.whole);
         let (name, sender) = (origin.name.as_ref(), origin.sender);
         let arrived = self.incoming.receive_named(bytes, name, sender, origin.arrival, &mut whole);
-        let handled = self.arrived(arrived, origin.address);
+        let handled = self.handle(arrived, origin.address);
         self.whole = whole;
         handled?;
         // An epoch is new once in a run of a gateway.
@@ -205,7 +206,7 @@ impl<'a> Reception<'a> {
     pub fn look(&mut self, now: Instant, more: bool) -> Result<(), End> {
         if let Some(publication) = &mut self.publication {
             let now = crate::now();
-            publication.look(now.monotonic_ns, if more { self.taken } else { now });
+            publication.look(now.monotonic_ns, if more { self.last_arrival } else { now });
         }
         let (gateways, publication) = (self.incoming.gateways(), self.publication.as_ref());
         let so_far = Evictions {
@@ -214,7 +215,7 @@ impl<'a> Reception<'a> {
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),
         };
-        self.capacity.look(so_far, now).map_or(Ok(()), |what| self.report.trouble(&what))
+        self.capacity.check(so_far, now).map_or(Ok(()), |what| self.report.trouble(&what))
     }
 
     /// Prints the counters. `others` are reasons for which datagrams were refused before they reached this receiver.
@@ -246,7 +247,8 @@ impl<'a> Reception<'a> {
         self.report.trouble(what)
     }
 
-    fn arrived(&mut self, arrived: Arrived<'_>, from: Option<IpAddr>) -> Result<(), End> {
+    /// Handles the result of receiving a datagram.
+    fn handle(&mut self, arrived: Arrived<'_>, from: Option<IpAddr>) -> Result<(), End> {
         if let (Some(head), Some(publication)) = (arrived.begins(), &mut self.publication) {
             // A run of the same epoch that was active until now was another gateway's.
             publication.begun(head, now());
@@ -254,11 +256,11 @@ impl<'a> Reception<'a> {
         match arrived {
             Arrived::Sample(mut sample) => {
                 sample.announced = sample.announced.map(|announce| announce.only(&self.topics));
-                self.sample(&sample, from)
+                self.on_sample(&sample, from)
             }
             Arrived::Announced(mut announcement) => {
                 announcement.announce = announcement.announce.only(&self.topics);
-                self.announced(&announcement, from)
+                self.on_announcement(&announcement, from)
             }
             Arrived::Refused { shared: Some(hub), .. } => {
                 let what = duplicate_gateways(&self.report.names.of(hub));
@@ -278,7 +280,7 @@ impl<'a> Reception<'a> {
     }
 
     /// Publishes or prints a new sample.
-    fn sample(&mut self, sample: &RemoteSample<'_>, from: Option<IpAddr>) -> Result<(), End> {
+    fn on_sample(&mut self, sample: &RemoteSample<'_>, from: Option<IpAddr>) -> Result<(), End> {
         let RemoteSample { remote, missed, .. } = sample;
         let (head, topic) = (&remote.head, remote.topic);
         if !self.topics.contains(&topic) {
@@ -293,9 +295,9 @@ impl<'a> Reception<'a> {
                 self.incoming.count_no_room(head.hub);
                 self.trouble(NO_ROOM)?;
             }
-            return self.published(head, made, from);
+            return self.report_publication(head, made, from);
         }
-        if self.is_quiet {
+        if self.is_stats {
             return Ok(());
         }
         let sensor = &self.incoming.printed_name(head);
@@ -306,7 +308,7 @@ impl<'a> Reception<'a> {
     }
 
     /// Handles an announcement that is newer than all others of its sensor.
-    fn announced(&mut self, announcement: &Announcement, from: Option<IpAddr>) -> Result<(), End> {
+    fn on_announcement(&mut self, announcement: &Announcement, from: Option<IpAddr>) -> Result<(), End> {
         let Announcement { head, announce, is_named, behind_ns, .. } = announcement;
         if *is_named {
             self.report.named(head, announce.sensor())?;
@@ -316,11 +318,11 @@ impl<'a> Reception<'a> {
         }
         let Some(publication) = &mut self.publication else { return Ok(()) };
         let made = publication.announced(announcement, &self.report.names.of(head.hub), now());
-        self.published(head, made, from)
+        self.report_publication(head, made, from)
     }
 
     /// Reports that the topics of the sensor that sent `head` were created just now, or why they could not be.
-    fn published(
+    fn report_publication(
         &mut self,
         head: &Head,
         made: Result<Option<String>, Failure>,
@@ -369,7 +371,7 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(60);
 
 impl CapacityReporter {
     /// Returns the next report, if one is due.
-    fn look(&mut self, so_far: Evictions, now: Instant) -> Option<String> {
+    fn check(&mut self, so_far: Evictions, now: Instant) -> Option<String> {
         let is_recent = self.reported_at.is_some_and(|at| now - at < REPORT_INTERVAL);
         if so_far == self.reported || is_recent {
             return None;
@@ -399,13 +401,13 @@ mod tests {
 
     #[test]
     fn reports_at_once_and_then_once_a_minute() {
-        let (mut capacity, begin) = (CapacityReporter::default(), Instant::now());
+        let (mut capacity, start) = (CapacityReporter::default(), Instant::now());
         let mut reported = Vec::new();
         for n in 0..180_000_u64 {
             // Nothing happens in the second minute.
             let gateways = n.min(60_000) + n.saturating_sub(120_000);
             let so_far = Evictions { gateways, ..Evictions::default() };
-            if let Some(line) = capacity.look(so_far, begin + Duration::from_millis(n)) {
+            if let Some(line) = capacity.check(so_far, start + Duration::from_millis(n)) {
                 assert!(line.contains(" gateways were given") && !line.contains("samples"), "{line}");
                 reported.push(n);
             }

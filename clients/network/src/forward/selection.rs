@@ -1,12 +1,11 @@
-//! What goes out: topics of sensors, and every how manieth sample of each. Refuses to know which sensors there are.
+//! Selection of the topics that are sent, with a thinning factor for each.
 
 use std::num::NonZeroU64;
 
 use scanhub_schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
-
 use scanhub_verbs::names::Word;
 
-/// The topics that go out.
+/// Topics that are sent.
 #[derive(Clone, Debug)]
 pub struct Selection {
     entries: Vec<Entry>,
@@ -19,14 +18,14 @@ struct Entry {
 }
 
 impl Selection {
-    /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
-    /// named means all sensors. It then means telegrams if `bare`, and otherwise the topics that
-    /// [`is_default`](Self::is_default) accepts.
+    /// Parses `texts`, each a pattern `SENSOR/TOPIC`, which `:every=N` may follow to thin the samples. If there are none, selects
+    /// the telegrams of all sensors if `bare`, and otherwise the topics of all sensors that [`is_default`](Self::is_default)
+    /// accepts.
     ///
     /// # Errors
     ///
-    /// [`Kind::Usage`] with the topics that there are, or if a name or a number is not possible, something is named twice,
-    /// or is no telegram and `bare`.
+    /// Returns [`Kind::Usage`] if a pattern or a number is not valid, a pattern is given twice, or a pattern does not name
+    /// telegrams although `bare` is set.
     pub fn parse(texts: &[String], bare: bool) -> Result<Selection, Failure> {
         let mut entries: Vec<Entry> = Vec::new();
         for text in texts {
@@ -60,20 +59,24 @@ impl Selection {
         !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud)
     }
 
-    /// Every how manieth sample of this topic goes out, if any do: what names it closest wins.
+    /// Returns the thinning factor of this topic, or `None` if it is not sent. The most specific pattern applies.
     pub(super) fn every(&self, sensor: &str, topic: Topic) -> Option<NonZeroU64> {
         let word = |sensor: Option<&str>, topic| Word { sensor: sensor.map(str::to_owned), topic };
-        let closest = [(Some(sensor), Some(topic)), (Some(sensor), None), (None, Some(topic)), (None, None)];
-        let find = |wanted: Word| self.entries.iter().find(|entry| entry.word == wanted);
-        closest.into_iter().find_map(|(sensor, topic)| find(word(sensor, topic))).map(|entry| entry.every)
+        let most_specific_first =
+            [(Some(sensor), Some(topic)), (Some(sensor), None), (None, Some(topic)), (None, None)];
+        let find = |word: Word| self.entries.iter().find(|entry| entry.word == word);
+        most_specific_first
+            .into_iter()
+            .find_map(|(sensor, topic)| find(word(sensor, topic)))
+            .map(|entry| entry.every)
     }
 
-    /// Returns whether this topic goes out of any sensor.
+    /// Returns whether this topic of any sensor is sent.
     pub fn names(&self, topic: Topic) -> bool {
         self.entries.iter().any(|entry| entry.word.topic.is_none_or(|named| named == topic))
     }
 
-    /// The sensors that are named, each once.
+    /// Returns the sensors that are named, each once.
     pub(super) fn named(&self) -> Vec<&str> {
         let mut named: Vec<_> =
             self.entries.iter().filter_map(|entry| entry.word.sensor.as_deref()).collect();
@@ -82,7 +85,7 @@ impl Selection {
         named
     }
 
-    /// Who makes the topics that the sensor is named with: its link, if all of them are meant.
+    /// Returns the kind of publisher of the topics that are selected for this sensor. It is the link if all topics are.
     pub(super) fn maker_of(&self, sensor: &str) -> Maker {
         let words = self.entries.iter().map(|entry| &entry.word);
         let mut makers = words
@@ -91,13 +94,14 @@ impl Selection {
         makers.find(|maker| *maker != Maker::Link).unwrap_or(Maker::Link)
     }
 
-    /// Something goes out of sensors that are not named.
+    /// Returns whether topics of sensors are sent that are not named.
     pub(super) fn wants_all(&self) -> bool {
         self.entries.iter().any(|entry| entry.word.sensor.is_none())
     }
 }
 
 impl Entry {
+    /// Parses a pattern with an optional thinning factor.
     fn parse(text: &str) -> Result<Entry, Failure> {
         let (name, every) = match text.split_once(':') {
             None => (text, NonZeroU64::MIN),
@@ -140,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn all_but_what_runs_on_demand_or_nothing_but_telegrams() {
+    fn selects_default_topics_or_bare_telegrams() {
         let usual = selection(&[], false).unwrap();
         for topic in Topic::ALL {
             let rare = [Topic::Telegram, Topic::Lines, Topic::Motion, Topic::Early, Topic::Cloud];
@@ -157,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_named_wins_over_all() {
+    fn most_specific_pattern_applies() {
         let some = selection(&["*/scan:every=8", "front/scan:every=4", "front/zones"], false).unwrap();
         assert_eq!(every(&some, "front", Topic::Scan), Some(4));
         assert_eq!(every(&some, "rear", Topic::Scan), Some(8));
@@ -179,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_go_out_is_refused() {
+    fn refuses_invalid_patterns() {
         let kind = |texts: &[&str], bare| selection(texts, bare).map(drop).map_err(|failure| failure.kind);
         for bad in ["front", "front/scam", "*", "*/scam", "robot/scan"] {
             assert_eq!(kind(&[bad], false), Err(Kind::Usage), "{bad}");

@@ -1,49 +1,50 @@
-//! Where datagrams go: the groups on an interface and the hosts that get copies, each datagram to all of them. Refuses to
-//! know what a datagram says.
+//! Destinations of a gateway: the groups on an interface, and hosts that get copies. Each datagram is sent to all of them.
 
 use std::num::NonZeroU64;
 use std::sync::atomic::AtomicBool;
 
-use crate::lan::outgoing::{Form, Outgoing, Sample, Transmit};
 use scanhub_schema::datagram::{HEAD, MTU_ETHERNET, MTU_LEAST, PORT};
 use scanhub_schema::{Failure, Kind, Topic};
 
+use super::interface_monitor::InterfaceMonitor;
 use super::udp_destination::UdpDestination;
-use super::uplink::Uplink;
 use crate::forward::Carrier;
 use crate::gateway_identity::Life;
+use crate::lan::outgoing::{Form, Outgoing, Sample, Transmit};
 use crate::now;
 
-/// What goes out, and the account of it.
+/// Sending end of a gateway and its destinations.
 pub(super) struct Network {
     pub(super) life: Life,
     pub(super) outgoing: Outgoing,
     pub(super) destinations: Destinations,
 }
 
-/// Where it goes.
+/// All destinations of a gateway.
 pub(super) struct Destinations {
-    /// The groups, if an interface was named for them.
+    /// Groups, if an interface was named for them.
     pub(super) groups: Option<Groups>,
     /// Hosts that get copies.
     pub(super) copies: Vec<UdpDestination>,
 }
 
-/// The groups on an interface.
+/// Groups on one interface.
 pub(super) struct Groups {
-    pub(super) interface: Uplink,
+    pub(super) interface: InterfaceMonitor,
     destination: UdpDestination,
 }
 
 impl Network {
-    /// Datagrams of at most `longest` bytes, as `life`, to the groups on `interface`, if there is one, which routers pass on
-    /// `ttl` times, and to the hosts in `to`.
+    /// Opens a socket for each destination: the groups on `interface`, if it is named, with this `ttl`, and the hosts in `to`.
+    /// Datagrams have at most `longest` bytes, or less if the interface carries less.
     ///
-    /// [`Kind::Configuration`] if `longest` is not possible, a host is none or is named twice; [`Kind::Failed`] without sockets;
-    /// [`Kind::Interrupted`] if `stop` is set before it is known where the hosts are.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if `longest` is not possible, or a host is not valid or named twice,
+    /// [`Kind::Failed`] if a socket cannot be opened, and [`Kind::Interrupted`] if `stop` is set before all hosts are resolved.
     pub(super) fn open(
         life: Life,
-        interface: Option<Uplink>,
+        interface: Option<InterfaceMonitor>,
         to: &[String],
         form: Form,
         ttl: u8,
@@ -55,7 +56,7 @@ impl Network {
             let hint = format!("from {MTU_LEAST} to {MTU_ETHERNET}, the most that an Ethernet carries");
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
-        let (port, more) = match form {
+        let (port, more_ports) = match form {
             Form::Sealed | Form::Authenticated(_) => (PORT, 0),
             Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
         };
@@ -66,19 +67,19 @@ impl Network {
         let mut groups = groups.transpose()?;
         let mut copies: Vec<UdpDestination> = Vec::new();
         for text in to {
-            let copy = UdpDestination::host(text, more, stop)?;
-            if let Some(other) = copies.iter().find(|other| other.is_as(&copy)) {
+            let copy = UdpDestination::host(text, more_ports, stop)?;
+            if let Some(other) = copies.iter().find(|other| other.is_same(&copy)) {
                 let what = format!("cannot send to {text}: it is named twice");
                 let hint = format!("{} already gets a copy; name each host and port once", other.name);
                 return Err(Failure::new(Kind::Configuration, what, hint));
             }
             copies.push(copy);
         }
-        let room = groups.as_mut().and_then(|groups| {
+        let max_len = groups.as_mut().and_then(|groups| {
             groups.use_interface();
-            groups.destination.room(groups.interface.index()?)
+            groups.destination.max_len(groups.interface.index()?)
         });
-        let longest = longest.min(room.unwrap_or(longest)).max(HEAD);
+        let longest = longest.min(max_len.unwrap_or(longest)).max(HEAD);
         let outgoing = Outgoing::new(life.hub, life.epoch, form, longest);
         Ok(Network { life, outgoing, destinations: Destinations { groups, copies } })
     }
@@ -99,20 +100,20 @@ impl Carrier for Network {
 }
 
 impl Destinations {
-    /// All destinations, the groups first.
+    /// Returns all destinations, the groups first.
     pub(super) fn all(&self) -> impl Iterator<Item = &UdpDestination> {
         self.groups.iter().map(|groups| &groups.destination).chain(&self.copies)
     }
 
-    /// As [`all`](Destinations::all).
+    /// Returns the same destinations as [`all`](Destinations::all).
     pub(super) fn all_mut(&mut self) -> impl Iterator<Item = &mut UdpDestination> {
         self.groups.iter_mut().map(|groups| &mut groups.destination).chain(&mut self.copies)
     }
 
-    /// Goes on where the interface is now; whether its state is another one than before.
-    pub(super) fn look(&mut self) -> bool {
+    /// Follows changes of the interface. Returns whether its state has changed since the last call.
+    pub(super) fn update(&mut self) -> bool {
         let Some(groups) = &mut self.groups else { return false };
-        let changed = groups.interface.look();
+        let changed = groups.interface.update();
         if changed {
             groups.use_interface();
         }
@@ -121,25 +122,27 @@ impl Destinations {
 }
 
 impl Transmit for Destinations {
-    /// To all of them. It is sent if the groups were sent it, or without groups a host at least.
+    /// Sends a datagram to all destinations. It counts as sent if it was sent to the groups, or without groups to at least one
+    /// host.
     fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
-        let of_groups = self.groups.as_mut().map(|groups| groups.destination.send(datagram, group, above));
-        let mut of_copies = false;
+        let to_groups = self.groups.as_mut().map(|groups| groups.destination.send(datagram, group, above));
+        let mut to_copies = false;
         for copy in &mut self.copies {
-            of_copies |= copy.send(datagram, group, above);
+            to_copies |= copy.send(datagram, group, above);
         }
-        of_groups.unwrap_or(of_copies)
+        to_groups.unwrap_or(to_copies)
     }
 }
 
 impl Groups {
+    /// Sends on the interface in its current state.
     fn use_interface(&mut self) {
-        self.destination.is_cut = !self.interface.is_up();
+        self.destination.is_down = !self.interface.is_up();
         if let Some(index) = self.interface.index() {
             self.destination.use_interface(index);
         }
     }
 }
 
-/// The port of sensor 0 where nothing but telegrams goes out; the next sensor has the next one.
+/// Port of sensor 0 for bare telegrams. Each further sensor has the next port.
 const BARE_PORT: u16 = PORT + 1;

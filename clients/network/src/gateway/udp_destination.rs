@@ -1,5 +1,5 @@
-//! One destination of datagrams, with a socket of its own, so that one that is dead disturbs no other: the groups on an
-//! interface, or a host. Counts what the kernel took and what it refused; nothing that comes in is ever read.
+//! One destination of datagrams: the groups on an interface, or a host. Each has its own socket, so that a failing destination
+//! does not affect others. Counts the datagrams that the kernel accepted and refused, and never reads what others send here.
 
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -21,46 +21,51 @@ use scanhub_schema::{Failure, Kind};
 
 use super::host::Host;
 
-/// A destination.
+/// A destination of datagrams, with its counters.
 pub(super) struct UdpDestination {
-    /// The interface, or the host as the user wrote it.
+    /// Name of the interface, or the host as the user wrote it.
     pub(super) name: String,
-    /// Datagrams that the kernel took.
+    /// Datagrams that the kernel accepted.
     pub(super) sent: u64,
-    /// Datagrams that it did not take: full queues, no route, a destination that refused the one before.
+    /// Datagrams that were not sent: the queue was full, there was no route, the host refused an earlier datagram, or the
+    /// interface was down.
     pub(super) failed: u64,
-    /// Answers that what was sent before did not get there.
+    /// Errors that the network reported for earlier datagrams.
     pub(super) reported: u64,
-    /// Nothing gets out by the interface, although the kernel takes it: listeners on this machine may still hear it.
-    pub(super) is_cut: bool,
+    /// Whether the interface is down. The kernel still accepts datagrams then, and listeners on this machine receive them.
+    pub(super) is_down: bool,
     socket: UdpSocket,
     to: To,
-    error: Option<io::Error>,
-    told: u64,
-    trouble: Option<u32>,
+    last_error: Option<io::Error>,
+    /// Datagrams that were lost by the last check.
+    lost: u64,
+    /// While the destination fails: the number of checks since the last failure.
+    checks_without_failure: Option<u32>,
 }
 
 enum To {
-    /// All groups.
+    /// All groups, on this port.
     Groups {
         port: u16,
     },
     Host(Host),
 }
 
-/// What became of a destination.
+/// State change of a destination.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum News {
-    /// Nothing, or not all, gets there any more, with the last reason.
+pub(super) enum DestinationEvent {
+    /// Some or all datagrams are lost, with the last reason.
     Failing(String),
-    /// All is taken again.
+    /// All datagrams are accepted again.
     Well,
 }
 
 impl UdpDestination {
-    /// The groups, on the interface called `name`; routers pass `ttl` of them on.
+    /// Opens the groups on the interface called `name`. Datagrams cross at most `ttl` networks.
     ///
-    /// [`Kind::Failed`] if the system has no such socket.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if the socket cannot be opened.
     pub(super) fn groups(name: &str, port: u16, ttl: u8) -> Result<UdpDestination, Failure> {
         let destination = UdpDestination::new(name, To::Groups { port })?;
         let set = destination.socket.set_multicast_ttl_v4(ttl.into());
@@ -69,13 +74,17 @@ impl UdpDestination {
         Ok(destination)
     }
 
-    /// A host and port, and up to `more` ports above it. Failures as [`Host::parse`], and [`Kind::Failed`] as above.
-    pub(super) fn host(text: &str, more: u16, stop: &AtomicBool) -> Result<UdpDestination, Failure> {
-        UdpDestination::new(text, To::Host(Host::parse(text, more, stop)?))
+    /// Opens a host and port, and up to `more_ports` ports above it.
+    ///
+    /// # Errors
+    ///
+    /// Returns the same errors as [`Host::parse`], and [`Kind::Failed`] if the socket cannot be opened.
+    pub(super) fn host(text: &str, more_ports: u16, stop: &AtomicBool) -> Result<UdpDestination, Failure> {
+        UdpDestination::new(text, To::Host(Host::parse(text, more_ports, stop)?))
     }
 
-    /// What is sent to `other` gets to the same place.
-    pub(super) fn is_as(&self, other: &UdpDestination) -> bool {
+    /// Returns whether datagrams to `other` arrive at the same destination.
+    pub(super) fn is_same(&self, other: &UdpDestination) -> bool {
         match (&self.to, &other.to) {
             (To::Groups { .. }, To::Groups { .. }) => true,
             (To::Host(one), To::Host(other)) => one.address() == other.address(),
@@ -83,27 +92,27 @@ impl UdpDestination {
         }
     }
 
-    /// Goes on at the address that the host's name has now, if that is another one; to be called once a second.
+    /// Continues with the address that the host's name has now, and returns it if it has changed. Call it once a second.
     pub(super) fn follow_name(&mut self, now: Instant) -> Option<SocketAddr> {
         let To::Host(host) = &mut self.to else { return None };
-        let address = host.look(self.trouble.is_some(), now)?;
+        let address = host.new_address(self.checks_without_failure.is_some(), now)?;
         if address.is_ipv4() != host.address().is_ipv4() {
-            // Without a socket all stays as it is, and the name is asked for again.
+            // If the socket cannot be opened, keep the old address. The name is resolved again later.
             self.socket = socket(address.ip()).ok()?;
         }
-        host.move_to(address);
+        host.set_address(address);
         Some(address)
     }
 
-    /// Lets the groups be those on interface number `index`.
+    /// Sends to the groups on the interface with this index.
     pub(super) fn use_interface(&self, index: u32) {
         let any = Ipv4Addr::UNSPECIFIED;
-        // An interface that is gone again is seen at the next send.
+        // If the interface was removed in the meantime, the next datagram fails.
         let _ = set_ip_multicast_if_with_ifindex(&self.socket, &any, &any, index);
     }
 
-    /// The longest datagram that goes over interface number `index` in one piece, if that is known.
-    pub(super) fn room(&self, index: u32) -> Option<usize> {
+    /// Returns the length of the longest datagram that the interface with this index sends without fragments, if it is known.
+    pub(super) fn max_len(&self, index: u32) -> Option<usize> {
         const IP_AND_UDP: usize = 20 + 8;
         let any = Ipv4Addr::UNSPECIFIED;
         let probe = socket(any.into()).ok()?;
@@ -112,8 +121,8 @@ impl UdpDestination {
         (ip_mtu(&probe).ok()? as usize).checked_sub(IP_AND_UDP)
     }
 
-    /// Hands a datagram to the kernel, for the group with this last byte if it goes to groups, and to the port so much above
-    /// the usual one; whether it was taken.
+    /// Sends a datagram, to the group with this last byte if the destination is the groups, and to the port that is `above` ports
+    /// after the usual one. Returns whether the kernel accepted it.
     pub(super) fn send(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
         let mut address = match &self.to {
             To::Groups { port } => SocketAddr::from(([GROUPS[0], GROUPS[1], GROUPS[2], group], *port)),
@@ -121,43 +130,44 @@ impl UdpDestination {
         };
         address.set_port(address.port() + u16::from(above));
         match self.socket.send_to(datagram, address) {
-            Ok(_) if !self.is_cut => {
+            Ok(_) if !self.is_down => {
                 self.sent += 1;
                 return true;
             }
-            Ok(_) => self.error = Some(ErrorKind::NetworkDown.into()),
+            Ok(_) => self.last_error = Some(ErrorKind::NetworkDown.into()),
             Err(error) => {
-                self.error = Some(error);
-                self.drain();
+                self.last_error = Some(error);
+                self.read_errors();
             }
         }
         self.failed += 1;
         false
     }
 
-    /// What is new since the last call, a second ago. One that fails and succeeds by turns is failing.
-    pub(super) fn news(&mut self) -> Option<News> {
-        self.drain();
+    /// Checks for a state change. Call it once a second. A destination that fails and succeeds in turn is failing.
+    pub(super) fn check(&mut self) -> Option<DestinationEvent> {
+        self.read_errors();
         let lost = self.failed + self.reported;
-        let is_failing = lost > self.told;
-        self.told = lost;
-        match (&mut self.trouble, is_failing) {
+        let is_failing = lost > self.lost;
+        self.lost = lost;
+        match (&mut self.checks_without_failure, is_failing) {
             (None, false) => None,
-            (Some(calm), true) => {
-                *calm = 0;
+            (Some(checks), true) => {
+                *checks = 0;
                 None
             }
             (None, true) => {
-                self.trouble = Some(0);
-                Some(News::Failing(self.error.as_ref().map_or_else(|| NOBODY.into(), explain)))
+                self.checks_without_failure = Some(0);
+                let reason = self.last_error.as_ref().map_or_else(|| NOBODY.into(), explain);
+                Some(DestinationEvent::Failing(reason))
             }
-            (Some(calm), false) if *calm < CALM => {
-                *calm += 1;
+            (Some(checks), false) if *checks < RECOVERY_CHECKS => {
+                *checks += 1;
                 None
             }
             (Some(_), false) => {
-                self.trouble = None;
-                Some(News::Well)
+                self.checks_without_failure = None;
+                Some(DestinationEvent::Well)
             }
         }
     }
@@ -172,17 +182,17 @@ impl UdpDestination {
             sent: 0,
             failed: 0,
             reported: 0,
-            is_cut: false,
+            is_down: false,
             socket: socket(ip).map_err(|error| no_socket(&error))?,
             to,
-            error: None,
-            told: 0,
-            trouble: None,
+            last_error: None,
+            lost: 0,
+            checks_without_failure: None,
         })
     }
 
-    /// Takes what the network answered: it would stand in the way of the next datagram.
-    fn drain(&mut self) {
+    /// Reads and counts the errors that the network has reported. The next datagram would fail otherwise.
+    fn read_errors(&mut self) {
         let mut no_data = [];
         let flags = RecvFlags::ERRQUEUE | RecvFlags::DONTWAIT;
         while recvmsg(
@@ -198,14 +208,14 @@ impl UdpDestination {
     }
 }
 
-/// A socket that sends to addresses like `ip`.
+/// Opens a socket that sends to addresses of the same version as `ip`.
 fn socket(ip: IpAddr) -> io::Result<UdpSocket> {
     let any = if ip.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { IpAddr::from(Ipv6Addr::UNSPECIFIED) };
     let socket = UdpSocket::bind((any, 0))?;
-    // A queue that is full shall be told and not waited for.
+    // A full queue is an error, instead of a wait.
     socket.set_nonblocking(true)?;
-    // Without the first the kernel reports what its queues dropped as sent. And a datagram is never fragmented: one that is
-    // too long for the way is refused.
+    // Without the first option, the kernel reports datagrams as sent that its queues have dropped. The second one makes it refuse
+    // datagrams that are too long for the path, instead of fragmenting them.
     if ip.is_ipv4() {
         setsockopt(socket.as_raw_fd(), Ipv4RecvErr, &true)?;
         set_ip_mtu_discover(&socket, Ipv4PathMtuDiscovery::DO)?;
@@ -213,7 +223,7 @@ fn socket(ip: IpAddr) -> io::Result<UdpSocket> {
         setsockopt(socket.as_raw_fd(), Ipv6RecvErr, &true)?;
         set_ipv6_mtu_discover(&socket, Ipv6PathMtuDiscovery::DO)?;
     }
-    // What others may send here is never read and takes no memory: the least there is.
+    // Incoming datagrams are never read, so they get the smallest buffer.
     set_socket_recv_buffer_size(&socket, 0)?;
     Ok(socket)
 }
@@ -230,8 +240,9 @@ fn no_socket(error: &io::Error) -> Failure {
 }
 
 const NOBODY: &str = "nobody is there";
-/// Seconds without a failure until all is well: answers of a host that is not there come once a second at most.
-const CALM: u32 = 2;
+/// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host without
+/// a receiver at most once a second.
+const RECOVERY_CHECKS: u32 = 2;
 
 #[cfg(test)]
 mod tests {
@@ -241,7 +252,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_host_whose_name_moves_is_followed() {
+    fn follows_a_host_to_its_new_address() {
         static PORT: AtomicU16 = AtomicU16::new(0);
         static HAS_MOVED: AtomicBool = AtomicBool::new(false);
         fn resolve(_: &str) -> io::Result<Vec<SocketAddr>> {
@@ -255,7 +266,7 @@ mod tests {
         };
         PORT.store(there.local_addr().unwrap().port(), Ordering::SeqCst);
         let begin = Instant::now();
-        let host = Host::by(resolve, "robot:7", 0, &AtomicBool::new(false), begin).unwrap();
+        let host = Host::resolve_with(resolve, "robot:7", 0, &AtomicBool::new(false), begin).unwrap();
         let mut destination = UdpDestination::new("robot:7", To::Host(host)).unwrap();
         let later = begin + Duration::from_secs(60);
         assert_eq!(destination.follow_name(begin), None);
@@ -274,18 +285,18 @@ mod tests {
     }
 
     #[test]
-    fn a_host_where_nobody_listens_is_told_once() {
-        nobody_listens(UdpSocket::bind("127.0.0.1:0").unwrap());
+    fn reports_a_host_without_receiver_once() {
+        check_without_receiver(UdpSocket::bind("127.0.0.1:0").unwrap());
         match UdpSocket::bind("[::1]:0") {
-            Ok(receiver) => nobody_listens(receiver),
+            Ok(receiver) => check_without_receiver(receiver),
             Err(error) => eprintln!("skipped: no IPv6 here: {error}"),
         }
     }
 
-    fn nobody_listens(receiver: UdpSocket) {
+    fn check_without_receiver(receiver: UdpSocket) {
         let text = receiver.local_addr().unwrap().to_string();
         let mut destination = UdpDestination::host(&text, 0, &AtomicBool::new(false)).unwrap();
-        assert!(destination.send(b"one", 0, 0) && destination.news().is_none());
+        assert!(destination.send(b"one", 0, 0) && destination.check().is_none());
         drop(receiver);
         for _ in 0..4 {
             destination.send(b"two", 0, 0);
@@ -297,9 +308,12 @@ mod tests {
             destination.reported
         );
         assert_eq!(destination.sent + destination.failed, 5);
-        assert!(matches!(destination.news(), Some(News::Failing(_))) && destination.news().is_none());
+        assert!(
+            matches!(destination.check(), Some(DestinationEvent::Failing(_)))
+                && destination.check().is_none()
+        );
         let receiver = UdpSocket::bind(&text).unwrap();
-        assert_eq!((destination.news(), destination.news()), (None, Some(News::Well)));
+        assert_eq!((destination.check(), destination.check()), (None, Some(DestinationEvent::Well)));
         assert!(destination.send(b"three", 0, 0));
         let mut bytes = [0; 9];
         assert_eq!(receiver.recv(&mut bytes).unwrap(), 5);

@@ -435,8 +435,8 @@ impl GatewayTable {
         std::mem::take(&mut self.is_epoch_new).then(|| self.gateways.iter().filter_map(kept).collect())
     }
 
-    /// Keeps an authenticated epoch of `hub`. Whoever has the key may invent gateways: if there are too many, the one that
-    /// has been known for longest is forgotten.
+    /// Keeps an authenticated epoch of `hub`. Anyone with the key can invent gateways, so the one that has been
+    /// known for longest is forgotten if there are too many.
     fn keep_epoch(&mut self, hub: u64, epoch: u32) {
         let order = self.order();
         let gateway = self.gateways.entry(hub).or_default();
@@ -775,7 +775,7 @@ mod tests {
     }
 
     #[test]
-    fn a_greater_epoch_retires_the_older_one_of_its_hub() {
+    fn higher_epoch_retires_the_lower_one() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (hub, epoch, expected) in [
             (1, 7, Ok(Fresh::New)),
@@ -793,7 +793,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_refused_changes_nothing() {
+    fn refused_datagrams_change_nothing() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let damaged = |head: Head| {
             let mut buffer = [0; 60];
@@ -808,7 +808,7 @@ mod tests {
             assert_eq!(fresh(&mut table, bytes), Err(*refusal));
         }
         assert_eq!(table.rows().count(), 0);
-        assert_eq!(fresh(&mut table, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was not believed");
+        assert_eq!(fresh(&mut table, &zones(head(1, 1, 0))), Ok(Fresh::New), "epoch 2 was refused");
         assert_eq!(table.refused(DatagramError::Payload), 2);
     }
 
@@ -816,7 +816,7 @@ mod tests {
     fn memory_is_bounded() {
         let mut table = full();
         assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 1000), Err(DatagramError::Capacity));
-        assert_eq!(at(&mut table, &zones(head(1, 1, 2)), 1000), Ok(Fresh::New), "all go on");
+        assert_eq!(at(&mut table, &zones(head(1, 1, 2)), 1000), Ok(Fresh::New), "known gateways continue");
         for sensor in 1..=240 {
             for hub in 0..4 {
                 let bytes = zones(Head { sensor, ..head(hub, 1, 0) });
@@ -834,14 +834,14 @@ mod tests {
         assert_eq!(
             (sum.runs, sum.displaced, sum.lost),
             (1, 1, 0),
-            "one went for the row, and left its place"
+            "the run that was evicted for the row left a place"
         );
         let counted: u64 = table.rows().map(|row| row.received).sum();
         assert_eq!(counted + sum.received, 128 + 1 + 4 * 240 + 2);
     }
 
     #[test]
-    fn a_true_gateway_is_heard_at_once_after_any_number_of_invented_ones() {
+    fn accepts_gateway_after_many_invented_ones() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for number in 0..2 {
             assert_eq!(
@@ -866,7 +866,7 @@ mod tests {
     }
 
     #[test]
-    fn two_gateways_with_one_number_and_one_epoch_are_never_mixed() {
+    fn never_mixes_gateways_with_one_number_and_epoch() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
             table.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
@@ -894,7 +894,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_follows_a_silent_gateway_begins_anew() {
+    fn successor_of_a_silent_gateway_begins_a_run() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let mut hear = |from: u64, bytes: &[u8], now_ms: u64| {
             table.receive(bytes, from, now_ms * 1_000_000).map(|(_, fresh)| fresh)
@@ -914,7 +914,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_retired_makes_room_and_stays_in_the_sum() {
+    fn retired_runs_make_room_and_stay_in_totals() {
         let mut table = full();
         let fresh = |table: &mut GatewayTable, bytes: &[u8]| at(table, bytes, 1000);
         assert_eq!(fresh(&mut table, &zones(head(5, 1, 4))), Ok(Fresh::New));
@@ -925,7 +925,7 @@ mod tests {
         assert_eq!(
             fresh(&mut table, &zones(head(5, 1, 5))),
             Err(DatagramError::Epoch),
-            "given up is not forgotten"
+            "its epoch is still known"
         );
         assert!(knows(&table, 5, 2) && !knows(&table, 5, 1));
         // A damaged datagram evicts nothing.
@@ -948,21 +948,17 @@ mod tests {
     }
 
     #[test]
-    fn announcements_count_for_topics_that_are_listened_to() {
+    fn announcements_count_for_joined_topics() {
         let mut table = GatewayTable::new(&[Topic::Zones]);
         assert_eq!(fresh(&mut table, &announce(1, 10)), Ok(Fresh::New));
-        assert_eq!(
-            table.rows().map(|row| row.topic).collect::<Vec<_>>(),
-            [0],
-            "nothing sent, nothing to tell"
-        );
+        assert_eq!(table.rows().map(|row| row.topic).collect::<Vec<_>>(), [0], "no samples yet");
         assert_eq!(fresh(&mut table, &announce(1, 12)), Ok(Fresh::Duplicate));
         let rows: Vec<_> = table.rows().map(|row| (row.topic, row.received, row.lost())).collect();
         assert_eq!(rows, [(0, 1, 0), (Topic::Zones.number(), 0, 2)]);
     }
 
     #[test]
-    fn the_longest_retired_one_is_given_up() {
+    fn evicts_the_run_that_retired_first() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for run in [(1, 5), (2, 5), (3, 5), (2, 6), (1, 9), (2, 7)] {
             assert_eq!(hear(&mut table, run, delivers(0)), None);
@@ -977,13 +973,13 @@ mod tests {
         assert_eq!(evict(), None, "the others deliver");
         assert!(
             is_over(&table, (2, 6)) && !contains(&table, (2, 6)),
-            "its gateway goes on with a greater epoch"
+            "its gateway continues with a higher epoch"
         );
         assert!(contains(&table, (1, 9)) && contains(&table, (2, 7)) && contains(&table, (3, 5)));
     }
 
     #[test]
-    fn who_starts_again_makes_its_own_room() {
+    fn restarted_gateway_makes_its_own_room() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for hub in 0..MAX_RUNS as u64 {
             assert!(!is_full(&table));
@@ -1001,7 +997,7 @@ mod tests {
     }
 
     #[test]
-    fn who_only_announces_never_puts_out_who_delivers() {
+    fn announcements_never_evict_a_delivering_run() {
         let mut table = GatewayTable::new(&Topic::ALL);
         assert_eq!(hear(&mut table, (1, 1), delivers(0)), None);
         assert_eq!(hear(&mut table, (2, 1), delivers(0)), None);
@@ -1011,23 +1007,19 @@ mod tests {
             if n % 100 == 0 {
                 assert_eq!(hear(&mut table, (1, 1), delivers(n)), None, "{n}");
             }
-            let gone = hear(&mut table, (1000 + n, 1), announces(n));
-            assert!(gone.is_none_or(|(hub, _)| hub >= 1000 || hub == 2 && n >= 3000), "{n}: {gone:?}");
+            let evicted = hear(&mut table, (1000 + n, 1), announces(n));
+            assert!(evicted.is_none_or(|(hub, _)| hub >= 1000 || hub == 2 && n >= 3000), "{n}: {evicted:?}");
         }
         assert!(contains(&table, (1, 1)) && !contains(&table, (2, 1)));
     }
 
     #[test]
-    fn who_is_known_to_deliver_is_not_put_out_by_one_that_begins_to() {
+    fn proven_run_is_not_evicted_for_a_new_one() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let mut displaced = 0;
         for n in 0..30_000 {
             if n % 100 == 0 && !(10_000..20_000).contains(&n) {
-                assert_eq!(
-                    hear(&mut table, (1, 1), delivers(n)),
-                    None,
-                    "{n}: and its silence is not that long"
-                );
+                assert_eq!(hear(&mut table, (1, 1), delivers(n)), None, "{n}: its silence is too short");
             }
             if n > 1000 {
                 displaced += u32::from(hear(&mut table, (1000 + n, 1), delivers(n)).is_some());
@@ -1037,7 +1029,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_silence_goes_first() {
+    fn evicts_the_longest_silence_first() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for hub in 0..MAX_RUNS as u64 {
             for at_ms in [0, 2000 + hub] {
@@ -1051,7 +1043,7 @@ mod tests {
     }
 
     #[test]
-    fn names_come_with_announcements() {
+    fn announcements_give_names() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let head = Head { sensor: 1, ..head(5, 9, 0) };
         table.begin((5, 9), delivers(0));
@@ -1063,7 +1055,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_of_two_sensors_has_the_name_of_neither() {
+    fn row_of_two_sensors_has_no_name() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let row = Row::new((5, 9, 0, 4), 0);
         table.begin((5, 9), delivers(0));
@@ -1078,7 +1070,7 @@ mod tests {
     }
 
     #[test]
-    fn evicted_runs_are_forgotten() {
+    fn evicted_runs_have_no_names() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for epoch in 1..300 {
             table.receive(&zones(head(5, epoch, 0)), 1, 0).unwrap();
@@ -1089,7 +1081,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_that_differ_give_no_age_and_are_reported_once() {
+    fn differing_clocks_give_no_age_and_are_reported_once() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let head = |epoch, stamp_ms| Head { stamp_ns: stamp_ms * MS, ..head(5, epoch, 0) };
         let age_ns = |table: &GatewayTable, stamp_ms, wall_ms| table.age_ns(&head(1, stamp_ms), wall_ms * MS);
@@ -1102,7 +1094,7 @@ mod tests {
         assert_eq!(age_ns(&table, 1, 2), None, "not known yet");
         assert_eq!(announce(&mut table, 1, 100, 101), None);
         assert_eq!((age_ns(&table, 200, 230), age_ns(&table, 200, 199)), (Some(30 * MS), None));
-        assert_eq!(announce(&mut table, 1, 100, 900), None, "one that waited");
+        assert_eq!(announce(&mut table, 1, 100, 900), None, "an announcement that waited");
         assert_eq!(announce(&mut table, 1, 3000, 1000), Some(-2000 * MS as i64));
         assert_eq!(announce(&mut table, 1, 4000, 2000), None);
         assert_eq!(age_ns(&table, 5000, 3030), None);

@@ -367,7 +367,7 @@ mod tests {
         announced_of(1, epoch, sequence, at_s, next)
     }
 
-    /// The same in this life of its hub.
+    /// Announces sensor 0 in this run of its hub.
     fn announced_of(boot: u64, epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
         let mut announce = Announce::new(boot, "front", "");
         let topic = Topic::Zones;
@@ -387,7 +387,7 @@ mod tests {
         Incoming::with_key(&Topic::ALL, key(), epochs.iter().copied().collect())
     }
 
-    /// What becomes of `bytes` from sender 1 at `at_s` of the listener's clock: why it is refused, if it is.
+    /// Receives `bytes` from sender 1 at `at_s` of the listener's clock. Returns the reason if it is refused.
     fn receive(incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
         receive_from(1, incoming, bytes, at_s)
     }
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn only_who_has_the_key_is_believed() {
+    fn accepts_only_datagrams_with_the_key() {
         let mut incoming = listener(&[]);
         let mut plain = [0; 400];
         let len = Zones::unknown().pack(&mut plain[HEAD..]).unwrap();
@@ -418,12 +418,12 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_that_is_sent_again_is_refused() {
+    fn refuses_replayed_recording() {
         let recorded = [announcement(1, 3, 100, 40), zones(1, 40), zones(1, 41)];
         let mut incoming = listener(&[]);
         let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 200));
-        assert_eq!(again, [Some(DatagramError::Untimely); 3], "the gateway is gone");
-        // The gateway goes on: its announcement is believed, and nothing that was sent before.
+        assert_eq!(again, [Some(DatagramError::Untimely); 3], "the gateway has exited");
+        // The gateway continues. Its announcement is accepted, but nothing that was sent before it.
         assert_eq!(receive(&mut incoming, &zones(1, 90), 200), Some(DatagramError::Untimely));
         assert_eq!(receive(&mut incoming, &announcement(1, 50, 200, 91), 203), None);
         assert_eq!(receive(&mut incoming, &zones(1, 91), 203), None);
@@ -435,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn epochs_only_go_forward_over_restarts_of_the_listener() {
+    fn epochs_only_increase_over_restarts() {
         let mut incoming = listener(&[]);
         assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
         let kept: Vec<_> =
@@ -452,25 +452,25 @@ mod tests {
     }
 
     #[test]
-    fn another_sender_is_not_the_next_life_of_a_silent_gateway() {
+    fn refuses_other_sender_of_a_silent_gateway() {
         let mut incoming = listener(&[]);
         assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
         assert_eq!(receive_from(2, &mut incoming, &zones(7, 0), 110), Some(DatagramError::Twin));
     }
 
     #[test]
-    fn a_gateway_may_change_its_address_while_its_hub_starts_again() {
+    fn gateway_may_move_while_its_hub_restarts() {
         let mut incoming = listener(&[]);
         let twin = Some(DatagramError::Twin);
         assert_eq!(receive(&mut incoming, &announcement(7, 4, 100, 0), 100), None);
         assert_eq!(receive(&mut incoming, &zones(7, 0), 100), None);
         let mut moved = |bytes: &[u8], at_s| receive_from(2, &mut incoming, bytes, at_s);
-        assert_eq!(moved(&announced_of(2, 7, 5, 102, 1), 102), twin, "the other one was heard just now");
+        assert_eq!(moved(&announced_of(2, 7, 5, 102, 1), 102), twin, "the old address has just sent");
         assert_eq!(moved(&announced_of(2, 7, 6, 104, 1), 110), twin, "recorded");
-        assert_eq!(moved(&announced_of(2, 7, 4, 110, 1), 110), twin, "of a number that came");
-        assert_eq!(moved(&zones(7, 1), 110), twin, "nothing was announced there yet");
+        assert_eq!(moved(&announced_of(2, 7, 4, 110, 1), 110), twin, "a number that has arrived");
+        assert_eq!(moved(&zones(7, 1), 110), twin, "not announced from there yet");
         assert_eq!(moved(&announced_of(2, 7, 8, 110, 1), 110), None);
-        assert_eq!(moved(&zones(7, 0), 110), None, "which is a duplicate");
+        assert_eq!(moved(&zones(7, 0), 110), None, "a duplicate");
         assert_eq!(moved(&zones(7, 1), 110), None);
         assert_eq!(incoming.gateways().rows().map(|row| row.received).sum::<u64>(), 4);
         assert_eq!(receive(&mut incoming, &announcement(7, 9, 110, 1), 110), None, "and back, the same boot");
@@ -478,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_of_a_recording_are_refused_before_memory_is_spent_on_them() {
+    fn refuses_replayed_parts_before_storing_them() {
         let mut incoming = listener(&[]);
         let part = |sequence, part| {
             let topic = Topic::Zones.number();
@@ -492,7 +492,7 @@ mod tests {
         assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 40), 100), None);
         assert_eq!(receive(&mut incoming, &part(39, 0), 100), Some(DatagramError::Stale));
         assert_eq!([0, 1].map(|at| receive(&mut incoming, &part(40, at), 100)), [None; 2]);
-        // A sample that is new goes on waiting, however many of those that came are sent again meanwhile.
+        // A new partial sample is kept, no matter how many complete ones are sent again in the meantime.
         assert_eq!(receive(&mut incoming, &part(60, 0), 101), None);
         for sequence in (41..50).chain(52..60) {
             [0, 1].iter().for_each(|&at| assert_eq!(receive(&mut incoming, &part(sequence, at), 101), None));
@@ -516,7 +516,7 @@ mod tests {
     }
 
     #[test]
-    fn a_life_begins_once_also_where_datagrams_come_in_one_moment() {
+    fn run_begins_once_even_in_one_instant() {
         let mut incoming = Incoming::new(&Topic::ALL);
         let mut begins = |epoch, sequence, from, ms: u64| {
             let arrival = Stamp { monotonic_ns: ms * 1_000_000, wall_ns: 0 };
@@ -527,7 +527,7 @@ mod tests {
         };
         assert_eq!([begins(7, 0, 1, 10), begins(7, 1, 1, 10), begins(7, 2, 1, 11)], [Some(7), None, None]);
         assert_eq!([begins(8, 0, 1, 11), begins(8, 1, 1, 11), begins(7, 3, 1, 11)], [Some(8), None, None]);
-        assert_eq!([begins(8, 0, 2, 3000), begins(8, 0, 2, 3011)], [None, Some(8)], "another one's");
+        assert_eq!([begins(8, 0, 2, 3000), begins(8, 0, 2, 3011)], [None, Some(8)], "another gateway");
     }
 
     #[test]

@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_is_bounded_whoever_sends() {
+    fn memory_is_bounded() {
         let mut parts = Reassembler::default();
         for hub in 0..1000 {
             for sequence in 0..6 {

@@ -204,8 +204,8 @@ impl<S: TopicStore> Republisher<S> {
             return Ok(None);
         }
         while at.is_none() && self.is_full(announce) {
-            match self.least(arrival).filter(|_| arrival.delivers && self.allowance > 0) {
-                Some(least) => self.evict(least, now),
+            match self.next_evicted(arrival).filter(|_| arrival.delivers && self.allowance > 0) {
+                Some(evicted) => self.evict(evicted, now),
                 None => return Ok(None),
             }
         }
@@ -232,8 +232,8 @@ impl<S: TopicStore> Republisher<S> {
             let made = missing.iter().try_for_each(|&topic| sensor.add(topic));
             made.inspect_err(|_| missing.iter().for_each(|&topic| sensor.remove(topic)))?;
         }
-        let is_told = std::mem::replace(&mut self.sensors[at].is_told, true);
-        Ok((!is_told).then_some(name))
+        let is_reported = std::mem::replace(&mut self.sensors[at].is_reported, true);
+        Ok((!is_reported).then_some(name))
     }
 
     /// Returns whether the sensor that sent `head` is not published, and another one may be evicted for it.
@@ -292,7 +292,7 @@ impl<S: TopicStore> Republisher<S> {
     }
 
     /// Returns the position of the sensor that is evicted next for another one.
-    fn least(&self, arrival: Arrival) -> Option<usize> {
+    fn next_evicted(&self, arrival: Arrival) -> Option<usize> {
         let may_go = |at: &usize| self.sensors[*at].standing.may_go(arrival);
         (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].standing.worth_ns())
     }
@@ -589,7 +589,7 @@ mod tests {
     }
 
     #[test]
-    fn publishes_sensor_once_its_gateway_has_delivered_for_a_second() {
+    fn publishes_sensor_after_a_second_of_samples() {
         let mut network = Network::new(MAX_SENSORS);
         assert_eq!(
             [network.announce(5, 0), network.zones(5, 0), network.announce(5, 900)],

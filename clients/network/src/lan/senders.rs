@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn two_gateways_are_kept_apart_and_known_after_two_announcements() {
+    fn detects_two_gateways_by_their_announcements() {
         let mut senders = Senders::NONE;
         assert_eq!(send(&mut senders, 1, None, 0), SenderMatch::Own);
         assert_eq!(send(&mut senders, 2, None, 1), SenderMatch::Twin, "it did not say who it is");
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn sockets_of_one_gateway_are_one_also_when_its_hub_starts_again() {
+    fn sockets_of_one_gateway_match_after_a_hub_restart() {
         let mut senders = Senders::NONE;
         for second in 0..20 {
             // Copies arrive first, one of them late. The hub restarts every five seconds.
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gateway_whose_address_changed_goes_on_and_another_one_begins_anew() {
+    fn moved_gateway_continues_and_another_begins() {
         let mut senders = Senders::NONE;
         send(&mut senders, 1, Some(7), 0);
         assert_eq!(send(&mut senders, 2, None, 100), SenderMatch::Twin);
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn strangers_put_out_neither_the_gateway_nor_what_is_known_of_it() {
+    fn invented_senders_do_not_evict_the_gateway() {
         let mut senders = Senders::NONE;
         send(&mut senders, 1, Some(7), 0);
         for n in 0..1000 {
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn late_datagrams_of_a_previous_run_are_not_another_gateway() {
+    fn late_datagrams_are_not_another_gateway() {
         let mut detector = DuplicateDetector::default();
         assert!(reports(&mut detector, 0, 1, 1000).is_empty(), "a restart");
         assert!(reports(&mut detector, 3_600_000, 1, 1000).is_empty(), "and another one");

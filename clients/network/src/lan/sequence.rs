@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn announcements_tell_what_was_lost_before_and_after() {
+    fn announcements_reveal_losses_before_and_after() {
         let mut row = row(10);
         assert_eq!(figures(&row), (0, 0, 0, 0));
         row.announce(13);

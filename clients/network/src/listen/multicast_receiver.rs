@@ -1,5 +1,5 @@
-//! The socket that hears the groups, on every interface that has a link, also on one that comes later or comes back.
-//! It sends nothing. Refuses to know what a datagram says.
+//! Socket that receives the datagrams of groups on every interface with a carrier, including interfaces that appear or come
+//! back later.
 
 use std::io::{self, IoSliceMut};
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
@@ -17,60 +17,64 @@ use scanhub_schema::datagram::{GROUPS, PORT};
 use scanhub_schema::{Failure, Kind};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, SockRef, Socket, Type};
 
-use crate::interface::{Changes, Interface, interfaces, named};
+use crate::interface::{Interface, InterfaceChanges, interfaces, named};
+use crate::lan::Stamp;
 
-/// Hears groups.
+/// Receiver of groups.
 pub(super) struct MulticastReceiver {
     socket: UdpSocket,
     groups: Vec<Ipv4Addr>,
-    /// The one interface to hear on; none: all that can.
+    /// The only interface to receive on; `None`: all suitable ones.
     only: Option<String>,
     joined: Vec<Joined>,
-    changes: Changes,
-    /// The kernel has said that something changed.
+    changes: InterfaceChanges,
+    /// Whether the kernel has reported a change that was not handled yet.
     is_changed: bool,
-    look_at: Instant,
-    /// Why the groups could not be joined somewhere, or the interfaces not be had.
-    trouble: Option<String>,
-    /// Room for the kernel's word of when a datagram came.
-    stamp: Vec<u8>,
-    /// CLOCK_MONOTONIC when nothing waited, in ns.
+    /// Time of the next update without a report.
+    update_at: Instant,
+    /// Reason for which groups could not be joined or interfaces could not be listed, until it is taken.
+    problem: Option<String>,
+    /// Buffer for the kernel's timestamp of a datagram.
+    timestamp: Vec<u8>,
+    /// CLOCK_MONOTONIC when no datagram was waiting last, in ns.
     empty_ns: u64,
 }
 
-/// A datagram as it came.
-pub(super) struct Caught<'a> {
-    /// All of it.
+/// A received datagram.
+pub(super) struct ReceivedDatagram<'a> {
+    /// Whole datagram.
     pub(super) bytes: &'a [u8],
-    /// Its sender's address and port.
+    /// Address and port of the sender.
     pub(super) from: SocketAddrV4,
-    /// When it came, in ns of CLOCK_MONOTONIC and since 1970, however late it is read.
-    pub(super) arrival_ns: u64,
-    pub(super) wall_ns: u64,
+    /// Time at which it arrived, even if it was read later.
+    pub(super) arrival: Stamp,
 }
 
 /// An interface on which the groups were joined.
 struct Joined {
     name: String,
     index: u32,
-    /// It had a link when it was last looked at, and was not away since.
+    /// Whether it had a carrier at the last update, and has not lost it since.
     running: bool,
 }
 
-/// Between two looks at the interfaces, if the kernel says nothing: what could not be done is tried again.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+/// Interval between updates of the interfaces without a report of the kernel. Each one retries what has failed before.
+const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Room for what waits while this process does not run; the system gives less where its own limit is lower.
-const BUFFER: usize = 4 << 20;
+/// Size of the kernel's buffer for datagrams that arrive while this process does not run, in bytes. The system may reduce it.
+const RECEIVE_BUFFER: usize = 4 << 20;
 
-/// The longest datagram that there can be.
-pub(super) const LONGEST: usize = 65_536;
+/// Maximum length of a datagram, in bytes.
+pub(super) const MAX_DATAGRAM_LEN: usize = 65_536;
 
 impl MulticastReceiver {
-    /// Binds the port and joins the `groups` (last bytes) on the interface `only`, or wherever there is a link. If there
-    /// is none yet, it is waited for.
+    /// Binds the port, and joins the `groups` (their last bytes) on the interface `only`, or on all interfaces with a carrier. An
+    /// interface without a carrier is joined once it has one.
     ///
-    /// [`Kind::Configuration`] if there is no such interface, [`Kind::Failed`] if the port cannot be had.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if the interface does not exist or has no multicast, and [`Kind::Failed`] if the port is
+    /// not available.
     pub(super) fn open(
         only: Option<&str>,
         groups: &[u8],
@@ -83,8 +87,8 @@ impl MulticastReceiver {
                 return Err(Failure::new(Kind::Configuration, format!("{name} carries no multicast"), hint));
             }
         }
-        // First the watch: what changes after the look is heard.
-        let changes = Changes::watch()?;
+        // Subscribe before reading the state, so that no change is missed in between.
+        let changes = InterfaceChanges::subscribe()?;
         let socket = bind().map_err(|error| {
             let hint = "it is in use by a program that does not share it: `ss -lunp` names it";
             Failure::new(Kind::Failed, format!("cannot listen on UDP port {PORT}: {error}"), hint)
@@ -97,35 +101,35 @@ impl MulticastReceiver {
             joined: Vec::new(),
             changes,
             is_changed: false,
-            look_at: now,
-            trouble: None,
-            stamp: cmsg_space!(TimeSpec),
+            update_at: now,
+            problem: None,
+            timestamp: cmsg_space!(TimeSpec),
             empty_ns: clock::now_ns(),
         };
-        receiver.look(now);
+        receiver.update_interfaces(now);
         Ok(receiver)
     }
 
-    /// Joins the groups where a link came or came back, if the kernel has said that something changed, or the last look is
-    /// long enough ago. A switch that filters by group has forgotten us when a cable was pulled, and an interface that was
-    /// made anew never knew us. If the system does not tell its interfaces, all stays as it is until the next look.
-    pub(super) fn look(&mut self, now: Instant) {
-        if !self.is_changed && now < self.look_at {
+    /// Joins the groups on interfaces that have a new carrier, if the kernel has reported a change or an update is due. This is
+    /// necessary even for a known interface: a switch that filters by group forgets its members when a cable is unplugged.
+    /// If the system cannot list interfaces, the groups remain as they are until the next update.
+    pub(super) fn update_interfaces(&mut self, now: Instant) {
+        if !self.is_changed && now < self.update_at {
             return;
         }
         self.is_changed = false;
-        self.look_at = now + LOOK_EVERY;
+        self.update_at = now + UPDATE_INTERVAL;
         let joined = &mut self.joined;
-        self.changes.take(|away| {
+        self.changes.read(|lost| {
             joined
                 .iter_mut()
-                .filter(|joined| away.includes(joined.index))
+                .filter(|joined| lost.includes(joined.index))
                 .for_each(|joined| joined.running = false);
         });
         let all = match interfaces() {
             Ok(all) => all,
             Err(failure) => {
-                self.trouble = Some(failure.to_string());
+                self.problem = Some(failure.to_string());
                 return;
             }
         };
@@ -138,7 +142,7 @@ impl MulticastReceiver {
             is_there
         });
         for interface in &all {
-            if !self.wants(interface) {
+            if !self.is_suitable(interface) {
                 continue;
             }
             match self.joined.iter_mut().find(|joined| joined.index == interface.index) {
@@ -149,30 +153,35 @@ impl MulticastReceiver {
         }
     }
 
-    /// The names of the interfaces on which it hears.
+    /// Returns the names of the interfaces on which the groups are joined.
     pub(super) fn interfaces(&self) -> Vec<&str> {
         self.joined.iter().map(|joined| joined.name.as_str()).collect()
     }
 
-    /// Why the groups could not be joined somewhere, or the interfaces not be had, when that was tried last.
-    pub(super) fn take_trouble(&mut self) -> Option<String> {
-        self.trouble.take()
+    /// Returns the last reason for which groups could not be joined or interfaces could not be listed, once.
+    pub(super) fn take_problem(&mut self) -> Option<String> {
+        self.problem.take()
     }
 
-    /// The next datagram that waits, or nothing; `buffer` has [`LONGEST`] bytes.
+    /// Receives the next waiting datagram. `None` if none waits. `buffer` has [`MAX_DATAGRAM_LEN`] bytes.
     ///
-    /// [`Kind::Failed`] if the socket is of no use any more.
-    pub(super) fn receive<'a>(&mut self, buffer: &'a mut [u8]) -> Result<Option<Caught<'a>>, Failure> {
-        let (fd, stamp) = (self.socket.as_raw_fd(), &mut self.stamp);
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if the socket fails.
+    pub(super) fn receive<'a>(
+        &mut self,
+        buffer: &'a mut [u8],
+    ) -> Result<Option<ReceivedDatagram<'a>>, Failure> {
+        let (fd, timestamp) = (self.socket.as_raw_fd(), &mut self.timestamp);
         let mut room = [IoSliceMut::new(&mut *buffer)];
-        let received = recvmsg::<SockaddrIn>(fd, &mut room, Some(stamp), MsgFlags::empty());
-        let (len, from, came_ns) = match received {
+        let received = recvmsg::<SockaddrIn>(fd, &mut room, Some(timestamp), MsgFlags::empty());
+        let (len, from, arrived_ns) = match received {
             Ok(message) => {
-                let came_ns = message.cmsgs().find_map(|said| match said {
+                let arrived_ns = message.cmsgs().find_map(|control| match control {
                     ControlMessageOwned::ScmTimestampns(at) => Some(wall_ns(at)),
                     _ => None,
                 });
-                (message.bytes, message.address, came_ns)
+                (message.bytes, message.address, arrived_ns)
             }
             Err(Errno::EAGAIN) => {
                 self.empty_ns = clock::now_ns();
@@ -182,40 +191,42 @@ impl MulticastReceiver {
             Err(error) => return Err(Failure::new(Kind::Failed, format!("cannot receive: {error}"), "")),
         };
         let (now_ns, wall_ns) = (clock::now_ns(), clock::wall_ns());
-        let waited_ns = waited_ns(came_ns, wall_ns, now_ns.saturating_sub(self.empty_ns));
-        Ok(Some(Caught {
+        let waited_ns = waited_ns(arrived_ns, wall_ns, now_ns.saturating_sub(self.empty_ns));
+        Ok(Some(ReceivedDatagram {
             bytes: &buffer[..len],
             from: from.map_or(SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0), SocketAddrV4::from),
-            arrival_ns: now_ns - waited_ns,
-            wall_ns: wall_ns.saturating_sub(waited_ns),
+            arrival: Stamp { monotonic_ns: now_ns - waited_ns, wall_ns: wall_ns.saturating_sub(waited_ns) },
         }))
     }
 
-    /// Sleeps until a datagram waits, an interface changes, a signal comes or `left` is over.
-    pub(super) fn wait(&mut self, left: Duration) {
-        let left = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
-        // What would go wrong here, receiving tells.
+    /// Sleeps until a datagram arrives, an interface changes or a signal arrives, but no longer than `at_most`.
+    pub(super) fn wait(&mut self, at_most: Duration) {
+        let timeout =
+            Timespec { tv_sec: at_most.as_secs() as i64, tv_nsec: i64::from(at_most.subsec_nanos()) };
+        // If this fails, receiving fails, too, and returns the error.
         let mut both = [PollFd::new(&self.socket, PollFlags::IN), PollFd::new(&self.changes, PollFlags::IN)];
-        let _ = poll(&mut both, Some(&left));
+        let _ = poll(&mut both, Some(&timeout));
         self.is_changed = !both[1].revents().is_empty();
     }
 
-    fn wants(&self, interface: &Interface) -> bool {
+    /// Returns whether to receive on `interface`.
+    fn is_suitable(&self, interface: &Interface) -> bool {
         match &self.only {
             Some(name) => interface.name == *name,
-            // Those of containers and bridges have none, and there are more of them than a socket can join.
+            // Interfaces of containers and bridges have no address, and a socket cannot join on all of them.
             None => interface.multicast && interface.address.is_some(),
         }
     }
 
+    /// Joins the groups on `interface`.
     fn join(&mut self, interface: &Interface) {
         let index = InterfaceIndexOrAddress::Index(interface.index);
         let socket = SockRef::from(&self.socket);
-        // First: joining again what was joined before tells the network nothing.
+        // Leave first: joining a group that is already joined sends no message to the network.
         leave(&self.socket, &self.groups, interface.index);
         for group in &self.groups {
             if let Err(error) = socket.join_multicast_v4_n(group, &index) {
-                self.trouble = Some(format!("cannot join {group} on {}: {error}", interface.name));
+                self.problem = Some(format!("cannot join {group} on {}: {error}", interface.name));
                 leave(&self.socket, &self.groups, interface.index);
                 return;
             }
@@ -225,35 +236,35 @@ impl MulticastReceiver {
     }
 }
 
-/// Leaves what was joined of `groups` on interface number `index`. Of one that is gone, too: a socket keeps what it joined
-/// there, and can have 20 of them (`net.ipv4.igmp_max_memberships`).
+/// Leaves the groups that were joined on the interface with this index. This is necessary even if the interface no longer
+/// exists: a socket keeps its memberships there, and has 20 at most (`net.ipv4.igmp_max_memberships`).
 fn leave(socket: &UdpSocket, groups: &[Ipv4Addr], index: u32) {
     for group in groups {
         let _ = SockRef::from(socket).leave_multicast_v4_n(group, &InterfaceIndexOrAddress::Index(index));
     }
 }
 
-/// How long a datagram waited that came at `came_ns`, by a wall clock that says `wall_ns` now and may have been set meanwhile:
-/// never longer than it is since nothing waited, `at_most_ns`.
-fn waited_ns(came_ns: Option<u64>, wall_ns: u64, at_most_ns: u64) -> u64 {
-    came_ns.map_or(0, |came_ns| wall_ns.saturating_sub(came_ns)).min(at_most_ns)
+/// Returns how long a datagram has waited that arrived at `arrived_ns`. Both times come from the wall clock, which may have been
+/// set in between, so the result is limited to `at_most_ns`, the time since no datagram was waiting.
+fn waited_ns(arrived_ns: Option<u64>, wall_ns: u64, at_most_ns: u64) -> u64 {
+    arrived_ns.map_or(0, |arrived_ns| wall_ns.saturating_sub(arrived_ns)).min(at_most_ns)
 }
 
-/// A time since 1970, in ns.
+/// Returns a time since 1970, in ns.
 fn wall_ns(at: TimeSpec) -> u64 {
     u64::try_from(Duration::from(at).as_nanos()).unwrap_or_default()
 }
 
-/// Not bound to a group: copies that are sent to this machine alone are heard as well. What other programs have joined is
-/// not.
+/// Binds the port on all addresses, so that copies to this machine are received, too. Datagrams of groups that only other
+/// programs have joined are not received.
 fn bind() -> io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;
     socket.set_multicast_all_v4(false)?;
-    // Less is no reason to fail: what does not fit is lost, and counted.
-    let _ = socket.set_recv_buffer_size(BUFFER);
+    // With a smaller buffer, more datagrams are lost, and they are counted.
+    let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER);
     socket.set_nonblocking(true)?;
-    // What waited while this process did not run shall not be taken for new.
+    // Datagrams that waited while this process did not run must not count as new.
     setsockopt(socket.as_raw_fd(), ReceiveTimestampns, &true)?;
     socket.bind(&SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, PORT).into())?;
     Ok(socket.into())
@@ -264,7 +275,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_waited_came_earlier_and_a_clock_that_is_set_says_nothing_else() {
+    fn waiting_time_survives_a_clock_that_is_set() {
         assert_eq!(waited_ns(Some(700), 1_000, 5_000), 300);
         assert_eq!(waited_ns(Some(700), 900_000, 5_000), 5_000, "set forward");
         assert_eq!(waited_ns(Some(700), 100, 5_000), 0, "set back");

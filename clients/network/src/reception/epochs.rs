@@ -4,9 +4,10 @@
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-use crate::lan::{Key, MAX_EPOCHS};
 use scanhub_schema::Failure;
 use scanhub_shm::StateDirectory;
+
+use crate::lan::{Key, MAX_EPOCHS};
 
 /// File with the epochs. Without a state directory, they are not kept.
 pub(super) struct Epochs {
@@ -68,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn listeners_that_keep_at_once_forget_nothing() {
+    fn concurrent_listeners_lose_no_epochs() {
         let root = tempfile::tempdir().unwrap();
         let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path().join("d"))));
         std::thread::scope(|scope| {
@@ -84,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_are_kept_than_a_listener_knows() {
+    fn number_of_kept_epochs_is_limited() {
         let root = tempfile::tempdir().unwrap();
         let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path().join("d"))));
         let many = |from: u64, count: u64| (from..from + count).map(|hub| (hub, hub as u32 + 1)).collect();
@@ -92,16 +93,12 @@ mod tests {
         epochs.keep(&many(50_000, 10)).unwrap();
         epochs.keep(&HashMap::from([(7, 1)])).unwrap();
         let kept = epochs.read().unwrap();
-        assert_eq!(
-            (kept.len(), kept.contains_key(&10)),
-            (MAX_EPOCHS, false),
-            "the oldest lives are forgotten"
-        );
+        assert_eq!((kept.len(), kept.contains_key(&10)), (MAX_EPOCHS, false), "the oldest runs are dropped");
         assert_eq!((kept.get(&7), kept.get(&50_009)), (Some(&1), Some(&50_010)));
     }
 
     #[test]
-    fn the_greatest_of_all_listeners_is_kept() {
+    fn highest_epoch_of_all_listeners_is_kept() {
         let root = tempfile::tempdir().unwrap();
         let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(root.path().join("d"))));
         assert_eq!(epochs(1).read().unwrap(), HashMap::new());

@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_given_once_and_have_a_form() {
+    fn names_are_valid_and_unique() {
         let parse = |texts: &[&str]| Names::parse(&texts.iter().map(|&text| text.into()).collect::<Vec<_>>());
         let names = parse(&["robot1=00000000000000ab"]).unwrap();
         assert_eq!((names.of(0xab), names.of(1)), ("robot1".into(), "0000000000000001".into()));
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_of_all_sensors_are_received() {
+    fn receives_topics_of_all_sensors() {
         assert_eq!(received(&[]), Ok(Topic::ALL.to_vec()));
         assert_eq!(received(&["*/*"]), Ok(Topic::ALL.to_vec()));
         let two = Topic::ALL.into_iter().filter(|topic| matches!(topic, Topic::Scan | Topic::Zones));
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_received_alone_is_refused() {
+    fn refuses_single_sensors_and_thinning() {
         for (text, said) in [
             ("front/scan", "*/scan"),
             ("robot1.front/*", "*/*"),

@@ -191,7 +191,7 @@ impl<'a> Report<'a> {
             self.out.raw(format!("\x1b[{}A\x1b[J", self.drawn).as_bytes())?;
         }
         self.drawn = gateways.rows().count() + 2 + usize::from(gateways.evicted().runs > 0);
-        self.text_account(gateways, &[])
+        self.write_counters(gateways, &[])
     }
 
     /// Prints the counters, over those on the terminal if there are any. `others` are further reasons for which datagrams
@@ -202,7 +202,7 @@ impl<'a> Report<'a> {
         others: &[(&'static str, u64)],
     ) -> Result<(), End> {
         if !self.json {
-            return if self.drawn > 0 { self.draw(gateways) } else { self.text_account(gateways, others) };
+            return if self.drawn > 0 { self.draw(gateways) } else { self.write_counters(gateways, others) };
         }
         for row in gateways.rows() {
             let sensor = gateways.row_name(row);
@@ -225,7 +225,7 @@ impl<'a> Report<'a> {
         self.out.json(&Refused { class: self.words.refused, reasons: Reasons { gateways, others } })
     }
 
-    fn text_account(&mut self, gateways: &GatewayTable, others: &[(&'static str, u64)]) -> Result<(), End> {
+    fn write_counters(&mut self, gateways: &GatewayTable, others: &[(&'static str, u64)]) -> Result<(), End> {
         let titles = ["HUB", "EPOCH", "TOPIC", "RECEIVED", "LOST", "DUPLICATE", "REORDERED", "REPLACED"];
         let titles = &titles[..titles.len() - usize::from(!self.words.tells_replaced)];
         let mut rows = vec![titles.iter().map(|title| String::from(*title)).collect()];
@@ -487,13 +487,13 @@ fn known_id<S: Serializer>(hub: &Option<u64>, serializer: S) -> Result<S::Ok, S:
 fn sample_json(remote: &Remote<'_>, sensor: &str, out: &mut Output<'_>) -> Result<(), End> {
     // The flags are written after all other keys.
     let header = Header { flags: 0, ..remote.header(std::process::id()) };
-    show(remote, SampleLine { remote, sensor, header: &header, out })
+    show(remote, JsonLine { remote, sensor, header: &header, out })
 }
 
 /// Writes a sample of `sensor` and its gateway `hub` as text.
 fn sample_text(remote: &Remote<'_>, hub: &str, sensor: &str, line: &mut Vec<u8>) -> io::Result<()> {
     write!(line, "{hub}.{sensor}/{} ", remote.topic.name())?;
-    show(remote, ForPeople { header: &remote.header(std::process::id()), line })?;
+    show(remote, TextLine { header: &remote.header(std::process::id()), line })?;
     if let Some(age_ms) = age_ms(remote) {
         write!(line, ", {age_ms:.1} ms old")?;
     }
@@ -508,7 +508,7 @@ fn age_ms(remote: &Remote<'_>) -> Option<f64> {
 macro_rules! payloads {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Shows the payload by `how`, unless there is too little memory to unpack it.
-        fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
+        fn show<E>(remote: &Remote<'_>, how: impl PrintFormat<E>) -> Result<(), E> {
             match remote.topic {
                 $(Topic::$topic => remote
                     .payload
@@ -522,36 +522,36 @@ macro_rules! payloads {
 scanhub_schema::for_each_topic!(payloads);
 
 /// A form in which a payload is printed.
-trait Way<E> {
+trait PrintFormat<E> {
     fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), E>;
 }
 
-struct ForPeople<'a> {
+struct TextLine<'a> {
     header: &'a Header,
     line: &'a mut Vec<u8>,
 }
 
-impl Way<io::Error> for ForPeople<'_> {
+impl PrintFormat<io::Error> for TextLine<'_> {
     fn show<P: Show + ?Sized>(self, payload: &P) -> io::Result<()> {
         payload.text(self.header, self.line)
     }
 }
 
-struct SampleLine<'a, 'out> {
+struct JsonLine<'a, 'out> {
     remote: &'a Remote<'a>,
     sensor: &'a str,
     header: &'a Header,
     out: &'a mut Output<'out>,
 }
 
-impl Way<End> for SampleLine<'_, '_> {
+impl PrintFormat<End> for JsonLine<'_, '_> {
     fn show<P: Show + ?Sized>(self, payload: &P) -> Result<(), End> {
         let (sensor, header) = (self.sensor, self.header);
         payload.json(sensor, header, self)
     }
 }
 
-impl Keys for SampleLine<'_, '_> {
+impl Keys for JsonLine<'_, '_> {
     /// Adds the keys that every class of a remote sample has after its own.
     fn take(self, keys: impl Serialize) -> Result<(), End> {
         #[derive(Serialize)]

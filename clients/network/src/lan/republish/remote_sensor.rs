@@ -19,17 +19,17 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     /// Rank when there is no room for another sensor.
     pub(super) standing: Standing,
     /// Whether it was reported that all announced topics exist.
-    pub(super) is_told: bool,
+    pub(super) is_reported: bool,
     /// By topic.
     streams: [Option<Stream>; Topic::ALL.len()],
     /// Last status with its header.
-    last: Option<(Status, Header)>,
+    last_status: Option<(Status, Header)>,
     /// Header of the last zones.
-    zoned: Option<Header>,
+    last_zones: Option<Header>,
     /// Time of the last sample, in ns of CLOCK_MONOTONIC; `None` while the sensor is silent.
     heard_ns: Option<u64>,
     /// Reason for which subscribers must be woken.
-    news: Option<Wake>,
+    pending_wake: Option<Wake>,
     /// Process that publishes it.
     pid: u32,
     topics: T,
@@ -57,12 +57,12 @@ impl<T: SensorTopics> RemoteSensor<T> {
             source: None,
             announced: 0,
             standing: Standing::NONE,
-            is_told: false,
+            is_reported: false,
             streams: [const { None }; Topic::ALL.len()],
-            last: None,
-            zoned: None,
+            last_status: None,
+            last_zones: None,
             heard_ns: None,
-            news: None,
+            pending_wake: None,
             pid,
             topics,
         }
@@ -98,11 +98,11 @@ impl<T: SensorTopics> RemoteSensor<T> {
     pub(super) fn replaced(&mut self, now: Stamp) {
         self.source = None;
         self.heard_ns = None;
-        if let Some(header) = self.zoned.take().filter(|_| self.has(Topic::Zones)) {
+        if let Some(header) = self.last_zones.take().filter(|_| self.has(Topic::Zones)) {
             self.send(Topic::Zones, &stamped(header, now), &Zones::unknown());
-            self.news = Some(Wake::Telegram);
+            self.pending_wake = Some(Wake::Telegram);
         }
-        self.silent(now);
+        self.publish_silence(now);
         self.wake();
     }
 
@@ -131,7 +131,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
         if !self.topics.fits(topic, remote.payload) {
             return Outcome::NoRoom;
         }
-        let Placed { left_out, header } = stream.place(remote, self.pid);
+        let LocalNumber { left_out, header } = stream.place(remote, self.pid);
         self.topics.skip(topic, left_out);
         if topic != Topic::Status {
             self.topics.send(topic, &header, remote.payload);
@@ -139,10 +139,10 @@ impl<T: SensorTopics> RemoteSensor<T> {
             self.publish_status(*status, &header);
         }
         if topic == Topic::Zones {
-            self.zoned = Some(remote.header(self.pid));
+            self.last_zones = Some(remote.header(self.pid));
         }
         let why = if topic == Topic::Status { Wake::Status } else { Wake::Telegram };
-        self.news = match self.news {
+        self.pending_wake = match self.pending_wake {
             Some(Wake::Telegram) => Some(Wake::Telegram),
             _ => Some(why),
         };
@@ -151,7 +151,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
 
     /// Wakes the subscribers if something was published since the last call.
     pub(super) fn wake(&mut self) {
-        if let Some(why) = self.news.take() {
+        if let Some(why) = self.pending_wake.take() {
             self.topics.wake(why);
         }
     }
@@ -160,7 +160,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
     pub(super) fn look(&mut self, read: Stamp) {
         if self.heard_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
             self.heard_ns = None;
-            self.silent(read);
+            self.publish_silence(read);
             self.wake();
         }
         let keeps = |topic: &Topic| topic.row().kept > 0 && self.has(*topic);
@@ -175,23 +175,23 @@ impl<T: SensorTopics> RemoteSensor<T> {
     /// Publishes a received status. The start of its state is in time of another machine's clock, so it is replaced by the
     /// time at which the state was received first.
     fn publish_status(&mut self, mut status: Status, header: &Header) {
-        let same = self.last.filter(|(last, _)| last.state == status.state);
+        let same = self.last_status.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
-        self.last = Some((status, *header));
+        self.last_status = Some((status, *header));
         if self.has(Topic::Status) {
             self.send(Topic::Status, header, &status);
         }
     }
 
     /// Publishes that the sensor is silent, because its last status would otherwise remain forever.
-    fn silent(&mut self, now: Stamp) {
-        let Some((mut status, header)) = self.last else { return };
+    fn publish_silence(&mut self, now: Stamp) {
+        let Some((mut status, header)) = self.last_status else { return };
         status.state = State::Silent as u8;
         status.rate_mhz = 0;
         status.set_last_error("nothing arrives over the network");
         if self.has(Topic::Status) {
             self.publish_status(status, &stamped(header, now));
-            self.news = self.news.or(Some(Wake::Status));
+            self.pending_wake = self.pending_wake.or(Some(Wake::Status));
         }
     }
 
@@ -222,7 +222,7 @@ struct Stream {
 
 /// Number and header of a sample in this domain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Placed {
+struct LocalNumber {
     /// Numbers of the topic that are skipped before it, because their samples are missing.
     left_out: u64,
     /// Header with the period of sending, without the number in the topic.
@@ -234,7 +234,7 @@ impl Stream {
     /// the last one and it are skipped, whether they were lost or not published. In a new run of the gateway, these are all
     /// numbers before it. If the sensor has another number than before, none is skipped, because they may belong to another
     /// sensor.
-    fn place(&mut self, remote: &Remote<'_>, pid: u32) -> Placed {
+    fn place(&mut self, remote: &Remote<'_>, pid: u32) -> LocalNumber {
         let head = &remote.head;
         let next = (head.epoch, head.sensor, head.sequence);
         let steps = self.last.and_then(|last| steps(last, next));
@@ -245,7 +245,7 @@ impl Stream {
         };
         self.last = Some(next);
         let period_us = self.arrivals.period_us(remote.arrival_ns, steps.unwrap_or_default().into());
-        Placed { left_out: left_out.into(), header: Header { period_us, ..remote.header(pid) } }
+        LocalNumber { left_out: left_out.into(), header: Header { period_us, ..remote.header(pid) } }
     }
 }
 
@@ -262,12 +262,12 @@ fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
 struct PeriodEstimator {
     last_ns: Option<u64>,
     /// Times between the last samples as they were sent, in ns.
-    distances_ns: [u64; KEPT],
+    distances_ns: [u64; MEDIAN_OF],
     count: usize,
 }
 
-/// Number of times that count. Two gaps and a burst among them do not change the median.
-const KEPT: usize = 5;
+/// Number of distances whose median is the period. Two gaps and a burst among them do not change the median.
+const MEDIAN_OF: usize = 5;
 
 /// Maximum period. A longer time is a silence, and a verdict of that age is useless.
 const MAX_PERIOD_NS: u64 = 2_500_000_000;
@@ -280,11 +280,11 @@ impl PeriodEstimator {
         let before_ns = self.last_ns.replace(now_ns);
         let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
         if let Some(distance_ns) = distance_ns.filter(|distance_ns| *distance_ns <= MAX_PERIOD_NS) {
-            self.distances_ns[self.count % KEPT] = distance_ns;
+            self.distances_ns[self.count % MEDIAN_OF] = distance_ns;
             self.count += 1;
         }
         let mut known = self.distances_ns;
-        let known = &mut known[..self.count.min(KEPT)];
+        let known = &mut known[..self.count.min(MEDIAN_OF)];
         known.sort_unstable();
         let median_ns = known.get(known.len().saturating_sub(1) / 2);
         median_ns.map_or(0, |median_ns| (median_ns / 1000) as u32)
@@ -297,11 +297,11 @@ mod tests {
 
     use scanhub_schema::datagram::{Datagram, HEAD};
 
-    /// What was said of a sensor's status: the state, and its stamps in ms.
+    /// Published statuses of a sensor: the state, and its stamps in ms.
     #[derive(Default)]
-    struct Said(Vec<(Option<State>, u64, u64)>);
+    struct StatusLog(Vec<(Option<State>, u64, u64)>);
 
-    impl SensorTopics for Said {
+    impl SensorTopics for StatusLog {
         fn add(&mut self, _: Topic) -> Result<(), Failure> {
             Ok(())
         }
@@ -328,15 +328,15 @@ mod tests {
     const MS: u64 = 1_000_000;
 
     #[test]
-    fn a_silence_is_said_as_of_when_everything_was_read() {
-        let mut sensor = RemoteSensor::new("robot1.front", Said::default(), 1);
+    fn reports_silence_as_of_the_last_read() {
+        let mut sensor = RemoteSensor::new("robot1.front", StatusLog::default(), 1);
         sensor.add(Topic::Status).unwrap();
         let mut bytes = [0; MTU_ETHERNET];
         let status = Status { state: State::Streaming as u8, ..Status::default() };
         let len = status.pack(&mut bytes[HEAD..]).unwrap();
         let head = Head { topic: Topic::Status.number(), revision: 1, hub: 5, epoch: 1, ..Head::default() };
         let datagram = Datagram::read(head.seal(&mut bytes, len).unwrap()).unwrap();
-        let came = |ms| Remote {
+        let arrived = |ms| Remote {
             topic: Topic::Status,
             head: datagram.head,
             payload: CheckedPayload { bytes: datagram.payload, room: len },
@@ -347,10 +347,10 @@ mod tests {
             authenticated: false,
         };
         let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
-        assert_eq!(sensor.publish(&came(1_000)), Outcome::Published);
-        // The listener is behind: what came at 4.6 s is the next that it will read.
+        assert_eq!(sensor.publish(&arrived(1_000)), Outcome::Published);
+        // The listener lags: it reads next what arrived at 4.6 s.
         [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.look(read(ms)));
-        assert_eq!(sensor.publish(&came(4_600)), Outcome::Published);
+        assert_eq!(sensor.publish(&arrived(4_600)), Outcome::Published);
         sensor.look(read(5_000));
         let (streams, silent) = (Some(State::Streaming), Some(State::Silent));
         assert_eq!(
@@ -360,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_begin_anew_are_of_another_count() {
+    fn restarted_numbers_are_another_sequence() {
         assert_eq!(steps((1, 0, 100), (1, 0, 103)), Some(3));
         assert_eq!(steps((1, 0, u32::MAX), (1, 0, 1)), Some(2));
         assert_eq!(steps((1, 0, 100), (1, 0, 20)), None);
@@ -378,38 +378,37 @@ mod tests {
     }
 
     #[test]
-    fn it_is_the_median_of_the_last_distances() {
+    fn period_is_the_median_of_the_last_distances() {
         assert_eq!(periods_ms(&[100, 600, 1600, 2100, 2600]), [0, 500, 500, 500, 500]);
-        // What was lost, and what waited and came in a burst.
+        // Lost samples, and a burst of samples that waited.
         assert_eq!(
             periods_ms(&[0, 100, 200, 500, 600, 901, 902, 903]),
             [0, 100, 100, 100, 100, 100, 100, 100]
         );
-        // Thinned from now on: three tell.
+        // Samples are thinned from now on. Three of them change the median.
         assert_eq!(periods_ms(&[0, 20, 40, 60, 80, 100, 1100, 2100, 3100]).split_off(6), [20, 20, 1000]);
     }
 
     #[test]
-    fn what_is_lost_makes_it_no_longer() {
+    fn lost_samples_do_not_extend_the_period() {
         let mut arrivals = PeriodEstimator::default();
-        let mut came = |at_ms: u64, steps| arrivals.period_us(at_ms * MS, steps) / 1000;
-        assert_eq!([came(0, 1), came(20, 1), came(2_020, 100), came(4_020, 100)], [0, 20, 20, 20]);
-        assert_eq!(came(64_020, 3_000), 20, "out of sight for a minute");
-        // Another life of the gateway: how many of its numbers are of the time between is not known.
-        assert_eq!([came(65_020, 0), came(65_040, 1), came(65_060, 1)], [20, 20, 20]);
+        let mut arrive = |at_ms: u64, steps| arrivals.period_us(at_ms * MS, steps) / 1000;
+        assert_eq!([arrive(0, 1), arrive(20, 1), arrive(2_020, 100), arrive(4_020, 100)], [0, 20, 20, 20]);
+        assert_eq!(arrive(64_020, 3_000), 20, "no samples for a minute");
+        // In another run of the gateway, the number of samples in between is unknown.
+        assert_eq!([arrive(65_020, 0), arrive(65_040, 1), arrive(65_060, 1)], [20, 20, 20]);
     }
 
     #[test]
-    fn a_silence_is_no_period() {
+    fn silence_does_not_count_as_a_period() {
         assert_eq!(periods_ms(&[0, 90_000, 90_020, 190_000, 190_020]), [0, 0, 20, 20, 20]);
         assert_eq!(periods_ms(&[0, 2_500, 5_001, 7_501]), [0, 2_500, 2_500, 2_500]);
-        assert_eq!(periods_ms(&[500, 400, 300]), [0, 0, 0], "a clock that goes back");
+        assert_eq!(periods_ms(&[500, 400, 300]), [0, 0, 0], "a clock that is set back");
     }
 
-    /// How often the verdict of a stream becomes unknown whose samples come every `period_ms` for a minute, and how long
-    /// after its end it does so for good.
-    /// Of `sent` one comes.
-    fn followed(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
+    /// Follows a stream whose samples are sent every `period_ms` for a minute, and of which one in `sent` arrives. Returns how
+    /// often its verdict becomes unknown before the end, and how long after the end it does, in ms.
+    fn follow(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
         let (mut arrivals, mut freshness) = (PeriodEstimator::default(), Freshness::new(at(0)));
         let mut silences = 0;
         let mut next_ms = 0;
@@ -444,24 +443,24 @@ mod tests {
     }
 
     #[test]
-    fn a_verdict_is_as_fresh_as_its_stream_is_fast() {
+    fn verdict_expires_with_the_period() {
         for (period_ms, jitter_ms) in [(27, 0), (27, 20), (230, 0), (400, 60), (1_000, 100), (2_000, 200)] {
-            let (silences, ended_ms) = followed(period_ms, jitter_ms, 1);
+            let (silences, ended_ms) = follow(period_ms, jitter_ms, 1);
             let limit_ms = 2 * (period_ms + jitter_ms) + 41;
-            // Of a slow one it is not known before the second sample how slow it is.
+            // The period of a slow stream is unknown before its second sample.
             let before_known = u32::from(period_ms > 500);
-            assert_eq!(silences, before_known, "a sample each {period_ms} ms");
+            assert_eq!(silences, before_known, "a sample every {period_ms} ms");
             assert!(
                 (500..=limit_ms.max(500)).contains(&ended_ms),
-                "a sample each {period_ms} ms: {ended_ms} ms"
+                "a sample every {period_ms} ms: {ended_ms} ms"
             );
         }
-        assert!(followed(3_000, 0, 1).0 > 15, "too slow to be followed");
+        assert!(follow(3_000, 0, 1).0 > 15, "too slow for a verdict");
     }
 
     #[test]
-    fn a_bad_link_keeps_no_verdict_for_longer() {
-        // Each 30 ms one is sent, and one in two seconds comes: the verdict is known for a quarter of the time.
-        assert_eq!(followed(2_010, 0, 67), (29, 500));
+    fn bad_link_does_not_extend_a_verdict() {
+        // A sample is sent every 30 ms, and one arrives every 2 s. The verdict is known for a quarter of the time.
+        assert_eq!(follow(2_010, 0, 67), (29, 500));
     }
 }

@@ -1,5 +1,5 @@
-//! The network interface that datagrams to groups leave by, and whether anything gets out there. The kernel takes
-//! datagrams for an interface whose cable is out, and says nothing. Refuses to know what is sent.
+//! Monitors the network interface that multicast datagrams are sent on. The kernel accepts datagrams for an interface without a
+//! carrier and drops them without an error.
 
 use std::fmt::Display;
 use std::io::{PipeReader, PipeWriter, pipe};
@@ -12,73 +12,78 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use scanhub_schema::{Failure, Kind};
 
-use crate::interface::{Changes, Interface, interfaces, named};
+use crate::interface::{Interface, InterfaceChanges, interfaces, named};
 
-/// A network interface and its state, which a thread of its own watches: who sends has nothing to ask the kernel.
-pub(super) struct Uplink {
+/// A network interface and its state. A separate thread monitors it, so that the sender needs no system calls for it.
+pub(super) struct InterfaceMonitor {
     name: String,
     state: State,
-    /// What the watch saw last.
-    seen: Arc<AtomicU64>,
-    /// Closed, it ends the watch.
+    /// Last state that the thread has read.
+    latest: Arc<AtomicU64>,
+    /// Closing the pipe ends the thread.
     _end: PipeWriter,
 }
 
-/// What of an interface matters to who sends.
+/// State of an interface, as far as the sender needs it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct State {
+    /// The kernel's index; `None` if the interface does not exist.
     index: Option<u32>,
     is_up: bool,
 }
 
-/// Between two questions to a kernel that cannot tell, because descriptors or memory are short.
-const AGAIN: Duration = Duration::from_millis(500);
+/// Interval between queries of the kernel while they fail, because descriptors or memory are short.
+const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 
-impl Uplink {
-    /// The interface called `name`.
+impl InterfaceMonitor {
+    /// Starts to monitor the interface called `name`.
     ///
-    /// [`Kind::Configuration`] with those that there are if it is not there, [`Kind::Failed`] if it cannot be watched.
-    pub(super) fn open(name: &str) -> Result<Uplink, Failure> {
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist, and [`Kind::Failed`] if it cannot be
+    /// monitored.
+    pub(super) fn open(name: &str) -> Result<InterfaceMonitor, Failure> {
         let unwatched = |why: &dyn Display| {
             Failure::new(Kind::Failed, format!("cannot watch network interfaces: {why}"), "")
         };
-        // First the watch: what changes after the look is heard.
-        let changes = Changes::watch()?;
+        // Subscribe before reading the state, so that no change is missed in between.
+        let changes = InterfaceChanges::subscribe()?;
         let found = named(name)?;
         let state = State::of(Some(&found));
-        let seen = Arc::new(AtomicU64::new(state.word()));
+        let latest = Arc::new(AtomicU64::new(state.to_word()));
         let (ending, end) = pipe().map_err(|error| unwatched(&error))?;
-        let (name, theirs) = (found.name.clone(), seen.clone());
+        let (name, thread_latest) = (found.name.clone(), latest.clone());
         thread::Builder::new()
             .name("interfaces".into())
-            .spawn(move || watch(&name, changes, &ending, &theirs))
+            .spawn(move || monitor(&name, changes, &ending, &thread_latest))
             .map_err(|error| unwatched(&error))?;
-        Ok(Uplink { name: found.name, state, seen, _end: end })
+        Ok(InterfaceMonitor { name: found.name, state, latest, _end: end })
     }
 
-    /// Its name.
+    /// Returns the interface's name.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Its number; it has another one each time that it is made, and none while it is not there.
+    /// Returns the kernel's index. It changes when the interface is created again. `None` while the interface does not exist.
     pub(super) fn index(&self) -> Option<u32> {
         self.state.index
     }
 
-    /// It is up, has a carrier and an IPv4 address.
+    /// Returns whether the interface is enabled and has a carrier and an IPv4 address.
     pub(super) fn is_up(&self) -> bool {
         self.state.is_up
     }
 
-    /// Takes note of what changed since the last call; whether that was the number or the state of this interface.
-    pub(super) fn look(&mut self) -> bool {
-        let state = State::in_word(self.seen.load(Ordering::Relaxed));
+    /// Updates the state. Returns whether it has changed since the last call.
+    pub(super) fn update(&mut self) -> bool {
+        let state = State::from_word(self.latest.load(Ordering::Relaxed));
         std::mem::replace(&mut self.state, state) != state
     }
 }
 
 impl State {
+    /// Returns the state of an interface, or that of a missing one.
     fn of(found: Option<&Interface>) -> State {
         State {
             index: found.map(|found| found.index),
@@ -86,64 +91,63 @@ impl State {
         }
     }
 
-    /// In one word, so that it is seen whole: no interface has number 0.
-    fn word(self) -> u64 {
+    /// Packs the state into one word, so that it can be stored atomically. No interface has index 0.
+    fn to_word(self) -> u64 {
         u64::from(self.index.unwrap_or(0)) | u64::from(self.is_up) << 32
     }
 
-    fn in_word(word: u64) -> State {
+    fn from_word(word: u64) -> State {
         State { index: Some(word as u32).filter(|index| *index != 0), is_up: word >> 32 != 0 }
     }
 }
 
-/// Keeps what is `seen` of the interface called `name` as it is, until `end` is closed. If the kernel cannot tell what
-/// there is now, all stays as it was and it is asked again.
-fn watch(name: &str, mut changes: Changes, end: &PipeReader, seen: &AtomicU64) {
-    let mut again = None;
+/// Stores each new state of the interface called `name` in `latest`, until `end` is closed. If the kernel cannot list interfaces,
+/// the state remains, and the query is repeated.
+fn monitor(name: &str, mut changes: InterfaceChanges, end: &PipeReader, latest: &AtomicU64) {
+    let mut timeout = None;
     loop {
         let mut fds = [PollFd::new(&changes, PollFlags::IN), PollFd::new(end, PollFlags::IN)];
-        let polled = poll(&mut fds, again.as_ref());
+        let polled = poll(&mut fds, timeout.as_ref());
         if !fds[1].revents().is_empty() {
             return;
         }
         if polled.is_err_and(|error| error != Errno::INTR) {
-            thread::sleep(AGAIN);
+            thread::sleep(RETRY_INTERVAL);
         }
-        changes.take(|_| {});
+        changes.read(|_| {});
         match interfaces() {
             Ok(all) => {
                 let state = State::of(all.iter().find(|one| one.name == name));
-                seen.store(state.word(), Ordering::Relaxed);
-                again = None;
+                latest.store(state.to_word(), Ordering::Relaxed);
+                timeout = None;
             }
             Err(_) => {
-                let nanos = i64::from(AGAIN.subsec_nanos());
-                again = Some(Timespec { tv_sec: AGAIN.as_secs() as i64, tv_nsec: nanos });
+                let nanos = i64::from(RETRY_INTERVAL.subsec_nanos());
+                timeout = Some(Timespec { tv_sec: RETRY_INTERVAL.as_secs() as i64, tv_nsec: nanos });
             }
         }
     }
 }
 
-/// Nobody said where to send: what goes to groups is heard by everybody on the network, so that it goes to none that was
-/// not named.
-///
-/// [`Kind::Failed`] instead if the system does not tell its interfaces.
-pub(super) fn nowhere() -> Failure {
+/// Returns the error for a gateway without an interface and without hosts, with a list of all interfaces. The user must name
+/// an interface, because everyone on its network can read what is sent to groups. If the system cannot list interfaces,
+/// returns that error.
+pub(super) fn no_destination() -> Failure {
     match interfaces() {
-        Ok(all) => choose_one(&all),
+        Ok(all) => must_choose(&all),
         Err(failure) => failure,
     }
 }
 
-fn choose_one(all: &[Interface]) -> Failure {
-    let tell = |one: &Interface| match (one.up, one.multicast, one.address) {
+fn must_choose(all: &[Interface]) -> Failure {
+    let describe = |one: &Interface| match (one.up, one.multicast, one.address) {
         (false, ..) => format!("{} (down)", one.name),
         (_, false, _) => format!("{} (no multicast)", one.name),
         (.., None) => format!("{} (no IPv4 address)", one.name),
         (.., Some(address)) if one.loopback => format!("{} ({address}, this machine only)", one.name),
         (.., Some(address)) => format!("{} ({address})", one.name),
     };
-    let list = all.iter().map(tell).collect::<Vec<_>>().join(", ");
+    let list = all.iter().map(describe).collect::<Vec<_>>().join(", ");
     let hint = format!(
         "everybody on the interface can read what is sent there: name one with --interface, or as `interface` under \
          [gateway]; there are {list}; or name hosts with --to"
@@ -164,11 +168,11 @@ mod tests {
     }
 
     #[test]
-    fn who_names_none_is_told_which_there_are() {
+    fn error_lists_all_interfaces() {
         let some = Some(Ipv4Addr::LOCALHOST);
         let (lo, eth0, wlan0) = (interface("lo", some), interface("eth0", some), interface("wlan0", None));
         let down = Interface { name: "eth1".into(), up: false, ..eth0.clone() };
-        let failure = choose_one(&[lo, eth0, wlan0, down]);
+        let failure = must_choose(&[lo, eth0, wlan0, down]);
         assert_eq!(failure.kind, Kind::Configuration);
         let list =
             "lo (127.0.0.1, this machine only), eth0 (127.0.0.1), wlan0 (no IPv4 address), eth1 (down)";
@@ -176,21 +180,21 @@ mod tests {
     }
 
     #[test]
-    fn a_state_is_one_word() {
+    fn state_round_trips_through_a_word() {
         for state in [(None, false), (Some(1), false), (Some(u32::MAX), true)] {
             let state = State { index: state.0, is_up: state.1 };
-            assert_eq!(State::in_word(state.word()), state);
+            assert_eq!(State::from_word(state.to_word()), state);
         }
         let state = State { index: Some(1), is_up: true };
-        let seen = Arc::new(AtomicU64::new(state.word()));
-        let mut uplink = Uplink { name: "lo".into(), state, seen, _end: pipe().unwrap().1 };
-        assert!(!uplink.look() && uplink.is_up());
-        uplink.seen.store(0, Ordering::Relaxed);
-        assert!(uplink.look() && !uplink.is_up() && uplink.index().is_none() && !uplink.look());
+        let latest = Arc::new(AtomicU64::new(state.to_word()));
+        let mut monitor = InterfaceMonitor { name: "lo".into(), state, latest, _end: pipe().unwrap().1 };
+        assert!(!monitor.update() && monitor.is_up());
+        monitor.latest.store(0, Ordering::Relaxed);
+        assert!(monitor.update() && !monitor.is_up() && monitor.index().is_none() && !monitor.update());
     }
 
     #[test]
-    fn what_gets_nothing_out_is_not_up() {
+    fn is_up_needs_carrier_and_address() {
         let plugged = interface("eth0", Some(Ipv4Addr::LOCALHOST));
         let is_up = |found: Option<&Interface>| State::of(found).is_up;
         assert!(is_up(Some(&plugged)) && !is_up(None));
