@@ -1,5 +1,5 @@
-//! What it costs to check the MAC of a scan, compared with its checksum alone: `cargo run --release -p scanhub-network --example mac_cost`.
-//! A scan of 361 beams is one datagram, one of 3,240 beams with exact angles comes in parts. The least of many runs counts.
+//! Measures the cost of checking the MAC of a scan, compared with its checksum alone: `cargo run --release -p scanhub-network --example mac_cost`.
+//! A scan of 361 beams is one datagram. One of 3,240 beams with exact angles is sent in parts. The fastest of many runs counts.
 #![allow(clippy::print_stdout)]
 
 use std::hint::black_box;
@@ -12,7 +12,7 @@ use scanhub_schema::datagram::{Datagram, HEAD, Head, MAC, MTU_SAFE};
 const SCANS: u32 = 200;
 const RUNS: usize = 40;
 
-/// The datagrams of a payload of `len` bytes, with a MAC each.
+/// Returns the datagrams of a payload of `len` bytes, each with a MAC.
 fn datagrams(key: &Key, len: usize) -> Vec<Vec<u8>> {
     let room = MTU_SAFE - HEAD - MAC;
     let payload: Vec<u8> = (0..len).map(|at| (at * 7) as u8).collect();
@@ -26,8 +26,8 @@ fn datagrams(key: &Key, len: usize) -> Vec<Vec<u8>> {
     payload.chunks(room).enumerate().map(part).collect()
 }
 
-/// The least time that `work` takes for all datagrams of a scan, in ns.
-fn least_ns(datagrams: &[Vec<u8>], work: impl Fn(&[u8])) -> f64 {
+/// Returns the shortest time that `work` takes for all datagrams of a scan, in ns.
+fn min_ns(datagrams: &[Vec<u8>], work: impl Fn(&[u8])) -> f64 {
     let run = |_| {
         let begin = Instant::now();
         for _ in 0..SCANS {
@@ -42,10 +42,10 @@ fn main() {
     let key = Key::new(&[7; Key::LEN]);
     for (beams, of_beam) in [(361, 3), (3_240, 7)] {
         let datagrams = datagrams(&key, 64 + beams * of_beam);
-        let checksum = least_ns(&datagrams, |bytes| {
+        let checksum = min_ns(&datagrams, |bytes| {
             black_box(Datagram::read(bytes).is_ok());
         });
-        let both = least_ns(&datagrams, |bytes| {
+        let both = min_ns(&datagrams, |bytes| {
             let mac = Datagram::read(bytes).ok().and_then(|datagram| datagram.mac);
             assert!(mac.is_some_and(|mac| key.is_of(bytes, mac)));
         });

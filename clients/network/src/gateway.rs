@@ -379,7 +379,7 @@ impl<'a> Report<'a> {
         self.out.raw(&line)
     }
 
-    /// Clears the status line, if there is one.
+    /// Clears the status line on a terminal.
     fn clear_line(&mut self) -> Result<(), End> {
         match self.display {
             Display::Terminal => self.out.raw(CLEAR_LINE),
@@ -506,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn documentation_lists_topics_that_are_not_sent_by_default() {
+    fn pages_list_topics_that_are_not_sent_by_default() {
         let left_out: Vec<_> =
             Topic::ALL.into_iter().filter(|topic| !Selection::is_default(*topic)).collect();
         let names: Vec<_> = left_out.iter().map(|topic| topic.name()).collect();

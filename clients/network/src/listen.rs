@@ -1,4 +1,4 @@
-//! `scanhub listen`: receives what gateways send, and prints or publishes it with counters of what did not arrive.
+//! `scanhub listen`: receives samples from gateways, prints or publishes them, and counts those that did not arrive.
 //!
 //! With `--publish`, a datagram takes this path. Each step calls the next one, from `Listener::receive_batch` on:
 //!

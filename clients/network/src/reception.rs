@@ -42,7 +42,7 @@ pub struct Wanted<'a> {
     pub hubs: &'a [String],
     /// Key that datagrams are authenticated with. Without it, all datagrams are accepted.
     pub key: Option<Key>,
-    /// Directory of state that outlives the process, if there is one.
+    /// Directory of state that outlives the process; `None` if the environment names none.
     pub state: Option<StateDirectory>,
     /// Domain in which samples are published as `HUB.SENSOR`, instead of being printed.
     pub publish: Option<&'a Domain>,

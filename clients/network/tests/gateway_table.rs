@@ -1,4 +1,5 @@
-//! The receiver's account against a slow model that keeps every number, under whatever a network and strangers do.
+//! Compares the table of gateways with a slow model that keeps every number, while a network loses and reorders datagrams and
+//! strangers invent gateways.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,12 +11,12 @@ use scanhub_schema::{Background, Marks, Topic, Zones};
 /// Hub, epoch, sensor, topic.
 type Key = (u64, u32, u8, u8);
 
-/// What a datagram is, known without looking at its bytes: numbers do not wrap.
+/// A datagram with its content, whose numbers do not wrap.
 #[derive(Clone)]
 struct Sent {
     key: Key,
     number: u64,
-    /// Of an announcement: the next numbers.
+    /// Next number of each topic in an announcement.
     next: Vec<(u8, u64)>,
     bytes: Vec<u8>,
 }
@@ -44,25 +45,26 @@ impl Sent {
     }
 }
 
-/// All numbers that came.
+/// All numbers of one stream.
 #[derive(Default)]
 struct Numbers {
-    came: BTreeSet<u64>,
+    arrived: BTreeSet<u64>,
     expected: BTreeSet<u64>,
     duplicate: u64,
     reordered: u64,
 }
 
+/// Table of gateways that keeps everything.
 #[derive(Default)]
 struct Model {
     rows: BTreeMap<Key, Numbers>,
-    /// The greatest epoch of each hub.
-    living: BTreeMap<u64, u32>,
-    /// When they were heard last, and when the first and the last sample came, in ms.
-    heard: BTreeMap<u64, (u64, Option<(u64, u64)>)>,
-    /// The others, in the order in which they were retired.
+    /// Highest epoch of each hub.
+    active: BTreeMap<u64, u32>,
+    /// For each active run, the times of its last datagram, and of its first and last sample, in ms.
+    times: BTreeMap<u64, (u64, Option<(u64, u64)>)>,
+    /// Other runs, in the order in which they retired.
     retired: Vec<(u64, u32)>,
-    given_up: EvictedTotals,
+    evicted: EvictedTotals,
     refused: BTreeMap<&'static str, u64>,
 }
 
@@ -78,32 +80,32 @@ impl Model {
     fn take(&mut self, sent: &Sent, now_ms: u64) -> Result<Fresh, DatagramError> {
         let (hub, epoch, sensor, topic) = sent.key;
         let delivers = topic != Announce::NUMBER;
-        let before = self.living.get(&hub).copied();
+        let before = self.active.get(&hub).copied();
         if before.is_some_and(|greatest| greatest > epoch) {
             return Err(DatagramError::Epoch);
         }
-        let highest = self.rows.get(&sent.key).and_then(|row| row.came.last().copied());
+        let highest = self.rows.get(&sent.key).and_then(|row| row.arrived.last().copied());
         if highest.is_some_and(|highest| highest >= sent.number + WINDOW as u64) {
             return Err(DatagramError::Stale);
         }
         let is_new = before != Some(epoch);
-        let lives = self.living.len() + self.retired.len();
-        let is_full = self.rows.len() == MAX_ROWS || is_new && lives == MAX_RUNS;
+        let runs = self.active.len() + self.retired.len();
+        let is_full = self.rows.len() == MAX_ROWS || is_new && runs == MAX_RUNS;
         let has_retired = !self.retired.is_empty() || before.is_some_and(|older| older < epoch);
-        let can_give_up = has_retired || self.least(hub, delivers, now_ms).is_some();
-        if !self.rows.contains_key(&sent.key) && is_full && !can_give_up {
+        let can_evict = has_retired || self.next_evicted(hub, delivers, now_ms).is_some();
+        if !self.rows.contains_key(&sent.key) && is_full && !can_evict {
             return Err(DatagramError::Capacity);
         }
         if is_new {
             self.retired.extend(before.map(|older| (hub, older)));
-            self.living.remove(&hub);
-            self.heard.remove(&hub);
-            if lives == MAX_RUNS {
-                self.give_up(hub, delivers, now_ms);
+            self.active.remove(&hub);
+            self.times.remove(&hub);
+            if runs == MAX_RUNS {
+                self.evict(hub, delivers, now_ms);
             }
-            self.living.insert(hub, epoch);
+            self.active.insert(hub, epoch);
         }
-        let (heard, delivered) = self.heard.entry(hub).or_default();
+        let (heard, delivered) = self.times.entry(hub).or_default();
         *heard = now_ms;
         if delivers {
             *delivered = Some((delivered.map_or(now_ms, |(first, _)| first), now_ms));
@@ -111,13 +113,13 @@ impl Model {
         assert!(self.has_room(sent.key, delivers, now_ms));
         let row = self.rows.entry(sent.key).or_default();
         let fresh = match highest {
-            _ if row.came.contains(&sent.number) => Fresh::Duplicate,
+            _ if row.arrived.contains(&sent.number) => Fresh::Duplicate,
             Some(highest) if highest > sent.number => Fresh::Late,
             _ => Fresh::New,
         };
         row.duplicate += u64::from(fresh == Fresh::Duplicate);
         row.reordered += u64::from(fresh == Fresh::Late);
-        row.came.insert(sent.number);
+        row.arrived.insert(sent.number);
         row.expect(sent.number, sent.number + 1);
         for &(topic, next) in &sent.next {
             let key = (hub, epoch, sensor, topic);
@@ -128,18 +130,18 @@ impl Model {
         Ok(fresh)
     }
 
-    /// There is a row, or there can be one, after another life was given up if need be.
+    /// Returns whether there is a row or room for one. Evicts another run if necessary.
     fn has_room(&mut self, key: Key, delivers: bool, now_ms: u64) -> bool {
         if !self.rows.contains_key(&key) && self.rows.len() == MAX_ROWS {
-            self.give_up(key.0, delivers, now_ms);
+            self.evict(key.0, delivers, now_ms);
         }
         self.rows.contains_key(&key) || self.rows.len() < MAX_ROWS
     }
 
-    /// The gateway that makes room for a datagram of `hub`, if nothing is retired.
-    fn least(&self, hub: u64, delivers: bool, now_ms: u64) -> Option<u64> {
+    /// Returns the active gateway that makes room for a datagram of `hub` if no run is retired.
+    fn next_evicted(&self, hub: u64, delivers: bool, now_ms: u64) -> Option<u64> {
         let mut least: Option<(u64, u64)> = None;
-        for (&other, &(heard, delivered)) in &self.heard {
+        for (&other, &(heard, delivered)) in &self.times {
             let (mut kept_until, mut is_proven, mut is_busy) = (heard, false, false);
             if let Some((first, last)) = delivered {
                 is_proven = last >= first + 1_000;
@@ -154,22 +156,22 @@ impl Model {
         least.map(|(_, other)| other)
     }
 
-    fn give_up(&mut self, hub: u64, delivers: bool, now_ms: u64) {
-        let life = if self.retired.is_empty() {
-            let Some(other) = self.least(hub, delivers, now_ms) else { return };
-            self.heard.remove(&other);
-            self.given_up.displaced += 1;
-            (other, self.living.remove(&other).unwrap())
+    fn evict(&mut self, hub: u64, delivers: bool, now_ms: u64) {
+        let evicted = if self.retired.is_empty() {
+            let Some(other) = self.next_evicted(hub, delivers, now_ms) else { return };
+            self.times.remove(&other);
+            self.evicted.displaced += 1;
+            (other, self.active.remove(&other).unwrap())
         } else {
             self.retired.remove(0)
         };
-        let sum = &mut self.given_up;
+        let sum = &mut self.evicted;
         sum.runs += 1;
         self.rows.retain(|&(hub, epoch, ..), row| {
-            if (hub, epoch) != life {
+            if (hub, epoch) != evicted {
                 return true;
             }
-            let received = row.came.len() as u64;
+            let received = row.arrived.len() as u64;
             sum.received += received;
             sum.lost += row.sent() - received;
             sum.duplicate += row.duplicate;
@@ -178,10 +180,10 @@ impl Model {
         });
     }
 
-    /// Received, lost, duplicate, reordered.
+    /// Returns the received, lost, duplicate and reordered numbers of each stream.
     fn figures(&self) -> BTreeMap<Key, [u64; 4]> {
         let all = self.rows.iter().map(|(&key, row)| {
-            let received = row.came.len() as u64;
+            let received = row.arrived.len() as u64;
             (key, [received, row.sent() - received, row.duplicate, row.reordered])
         });
         all.filter(|(_, figures)| figures[0] + figures[1] > 0).collect()
@@ -189,10 +191,10 @@ impl Model {
 }
 
 impl Numbers {
-    /// `first` to `next` were sent, if `first` is one; nothing is known of what is before the first announcement.
+    /// Records that the numbers from `first` to `next` were sent. Numbers before the first announcement are unknown.
     fn expect(&mut self, first: u64, next: u64) {
         let known_first = self.expected.first().copied().unwrap_or(first);
-        // An announcement alone moves no beginning.
+        // An announcement alone does not move the start.
         let first = if first == next { known_first } else { first.min(known_first) };
         self.expected.extend([first, next.max(first)]);
     }
@@ -202,8 +204,8 @@ impl Numbers {
     }
 }
 
-fn figures(account: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
-    let rows = account.rows();
+fn figures(table: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
+    let rows = table.rows();
     rows.map(|row| {
         let key = (row.hub, row.epoch, row.sensor, row.topic);
         (key, [row.received, row.lost(), row.duplicate, row.reordered])
@@ -211,18 +213,18 @@ fn figures(account: &GatewayTable) -> BTreeMap<Key, [u64; 4]> {
     .collect()
 }
 
-/// Gateways that send, restart and announce, and a network between.
+/// Gateways that send, restart and announce, and a network.
 struct World {
     random: Rng,
     now: u64,
-    /// By hub and sensor: the epoch and the next number of each topic, announce first.
+    /// Hub, epoch, sensor, and the next number of each topic, announcements first.
     gateways: Vec<(u64, u32, u8, Vec<u64>)>,
     /// By time of arrival.
     underway: BTreeMap<(u64, u64), Sent>,
     count: u64,
-    /// One datagram of a stranger to so many of the gateways.
+    /// Number of datagrams of the gateways for each one of a stranger.
     strangers: u8,
-    /// So many strangers.
+    /// Number of strangers.
     crowd: u64,
 }
 
@@ -230,7 +232,7 @@ impl World {
     fn new(seed: u64) -> World {
         let mut random = Rng::with_seed(seed);
         let start = |random: &mut Rng| {
-            // Some begin close to the end of 32 bits.
+            // Some start close to the end of 32 bits.
             let near = (1 << 32) - random.u64(..2_000);
             [0, near, 1 << 31][random.usize(..3)]
         };
@@ -244,13 +246,13 @@ impl World {
         World { random, now: 0, gateways, underway: BTreeMap::new(), count: 0, strangers, crowd }
     }
 
-    /// One datagram goes out, and all that arrive meanwhile come back.
+    /// Sends one datagram. Returns all datagrams that arrive in the meantime.
     fn step(&mut self) -> Vec<Sent> {
         self.now += 1;
         let at = self.random.usize(..self.gateways.len());
-        let life = self.random.u32(..12_000);
+        let restart = self.random.u32(..12_000);
         let (hub, epoch, sensor, next) = &mut self.gateways[at];
-        if life == 0 {
+        if restart == 0 {
             *epoch += self.random.u32(1..3);
             next.fill(0);
         }
@@ -265,7 +267,7 @@ impl World {
         if self.random.u8(..20) == 0 {
             self.carry(sent);
         }
-        // A stranger.
+        // A stranger sends, too.
         if self.random.u8(..self.strangers) == 0 {
             let topic = [Announce::NUMBER, 4, 4, 4][self.random.usize(..4)];
             let hub = 100 + self.random.u64(..self.crowd);
@@ -288,19 +290,19 @@ impl World {
 }
 
 #[test]
-fn it_says_what_a_model_says_that_keeps_everything() {
-    let (mut refused, mut full, mut given_up, mut displaced) = (BTreeMap::new(), 0, 0, 0);
+fn table_agrees_with_a_model_that_keeps_everything() {
+    let (mut refused, mut full, mut evicted, mut displaced) = (BTreeMap::new(), 0, 0, 0);
     for seed in 0..20 {
         let mut world = World::new(seed);
-        let (mut account, mut model) = (GatewayTable::new(&Topic::ALL), Model::default());
-        // All that deliver are busy, or hardly any is.
+        let (mut table, mut model) = (GatewayTable::new(&Topic::ALL), Model::default());
+        // With the short tick, all delivering gateways are busy. With the long one, hardly any is.
         let (mut ticks, tick_ms) = (0, [1, 40][seed as usize % 2]);
         for step in 0..16_000 {
             for sent in world.step() {
-                // One clock tick each: who was not heard for longest is never two.
+                // One clock tick for each datagram, so that two gateways are never silent for the same time.
                 ticks += 1;
                 let now_ms = ticks * tick_ms;
-                let fresh = account.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
+                let fresh = table.receive(&sent.bytes, 1, now_ms * 1_000_000).map(|(_, fresh)| fresh);
                 assert_eq!(
                     fresh,
                     model.receive(&sent, now_ms),
@@ -309,30 +311,30 @@ fn it_says_what_a_model_says_that_keeps_everything() {
                 );
             }
             if step % 1_000 == 0 {
-                assert_eq!(figures(&account), model.figures(), "seed {seed}, step {step}");
+                assert_eq!(figures(&table), model.figures(), "seed {seed}, step {step}");
             }
         }
         full += u32::from(model.rows.len() == MAX_ROWS);
-        given_up += model.given_up.runs;
-        displaced += model.given_up.displaced;
-        assert_eq!((figures(&account), account.evicted()), (model.figures(), model.given_up), "seed {seed}");
+        evicted += model.evicted.runs;
+        displaced += model.evicted.displaced;
+        assert_eq!((figures(&table), table.evicted()), (model.figures(), model.evicted), "seed {seed}");
         for refusal in DatagramError::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();
-            assert_eq!(account.refused(refusal), count, "seed {seed}, {}", refusal.name());
+            assert_eq!(table.refused(refusal), count, "seed {seed}, {}", refusal.name());
             *refused.entry(refusal.name()).or_insert(0) += count;
         }
     }
-    // The network did what it was made for.
-    assert!(full > 0 && given_up > 100, "{full} full, {given_up} lives given up");
-    assert!(displaced > 100 && given_up > displaced, "{displaced} of them not over");
+    // Every kind of refusal and eviction has occurred.
+    assert!(full > 0 && evicted > 100, "{full} full, {evicted} runs evicted");
+    assert!(displaced > 100 && evicted > displaced, "{displaced} of them active");
     for refusal in [DatagramError::Epoch, DatagramError::Stale, DatagramError::Capacity] {
-        assert!(refused[refusal.name()] > 0, "nothing was ever {}", refusal.name());
+        assert!(refused[refusal.name()] > 0, "no datagram was refused as {}", refusal.name());
     }
 }
 
-/// With an announcement before and one behind, what is lost is what a relay dropped, whichever that was.
+/// Sends an announcement first and another one last, so that exactly the dropped samples count as lost.
 #[test]
-fn it_is_the_log_of_a_relay() {
+fn counters_agree_with_the_log_of_a_relay() {
     const SENT: u64 = 5_000;
     let topic = Topic::Zones.number();
     for seed in 0..50 {
@@ -355,20 +357,20 @@ fn it_is_the_log_of_a_relay() {
             }
         }
         arrivals.sort_by_key(|&(at, _)| at);
-        let mut account = GatewayTable::new(&Topic::ALL);
-        let (mut highest, mut below, mut came) = (0, 0, BTreeSet::new());
-        account.receive(&announce(0, first).bytes, 1, 0).unwrap();
+        let mut table = GatewayTable::new(&Topic::ALL);
+        let (mut highest, mut below, mut arrived) = (0, 0, BTreeSet::new());
+        table.receive(&announce(0, first).bytes, 1, 0).unwrap();
         for (_, sent) in &arrivals {
-            account.receive(&sent.bytes, 1, 0).unwrap();
-            below += u64::from(came.insert(sent.number) && sent.number < highest);
+            table.receive(&sent.bytes, 1, 0).unwrap();
+            below += u64::from(arrived.insert(sent.number) && sent.number < highest);
             highest = highest.max(sent.number);
         }
-        account.receive(&announce(1, first + SENT).bytes, 1, 0).unwrap();
+        table.receive(&announce(1, first + SENT).bytes, 1, 0).unwrap();
         let expected = [SENT - dropped, dropped, doubled, below];
-        assert_eq!(figures(&account)[&(1, 1, 0, topic)], expected, "seed {seed}");
+        assert_eq!(figures(&table)[&(1, 1, 0, topic)], expected, "seed {seed}");
         assert!(dropped > 100 && doubled > 30 && below > 100);
     }
 }
 
-/// Announce, marks, zones, background.
+/// Announcements, marks, zones and backgrounds.
 const TOPICS: [u8; 4] = [Announce::NUMBER, 3, 4, 6];

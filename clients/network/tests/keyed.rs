@@ -14,10 +14,10 @@ use scanhub_schema::{Family, Topic, Zones};
 use serde_json::Value;
 
 const SECOND_NS: u64 = 1_000_000_000;
-/// When the announcement comes with which it begins.
+/// Time of the first announcement.
 const BEGIN_S: u64 = 1_700_000_100;
 
-/// The list as it is built.
+/// Lines of the list that the test builds.
 struct List(Vec<String>);
 
 fn key() -> Key {
@@ -38,14 +38,14 @@ fn head(topic: Topic, sequence: u32) -> Head {
     }
 }
 
-/// The datagram with a MAC of `key`.
+/// Returns a datagram with a MAC of `key`.
 fn sealed(key: &Key, head: Head, payload: &[u8]) -> Vec<u8> {
     let mut buffer = vec![0; HEAD + payload.len() + 16];
     buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
     head.seal_with(&mut buffer, payload.len(), |covered| key.mac(covered)).expect("there is room").to_vec()
 }
 
-/// The datagram after a change, with a right checksum; the MAC is made anew if it covers the change.
+/// Returns a changed datagram with the right checksum, and with a new MAC if `is_signed`.
 fn changed(datagram: &[u8], is_signed: bool, change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let mut bytes = datagram.to_vec();
     change(&mut bytes);
@@ -199,7 +199,7 @@ fn values_are_these_bytes() {
 }
 
 #[test]
-fn the_receiving_end_makes_of_them_what_the_list_says() {
+fn receiver_handles_them_as_listed() {
     let keyed = keyed();
     let key = Key::new(&unhex(&keyed.key).try_into().expect("the length of a key"));
     let mut incoming = Incoming::with_key(&Topic::ALL, key.clone(), Default::default());
@@ -217,7 +217,7 @@ fn the_receiving_end_makes_of_them_what_the_list_says() {
             Arrived::Untimely { .. } => DatagramError::Untimely.name(),
             Arrived::Part => "part",
             Arrived::Announced(_) | Arrived::Sample(_) => "taken",
-            // An announcement that was overtaken says nothing new, and is no duplicate.
+            // An announcement that was overtaken contains nothing new, but is not a duplicate.
             Arrived::Known if step.outcome == "taken" => "taken",
             Arrived::Known => "duplicate",
             Arrived::Ignored | Arrived::Foreign => "ignored",

@@ -1,5 +1,5 @@
-//! Both ends of a network that loses, doubles, damages, delays and reorders datagrams, over lives of sensors, hub and
-//! gateway, in virtual time: what comes was sent, what does not is counted, and no verdict outlives its time.
+//! Both ends of a network that loses, duplicates, damages, delays and reorders datagrams, in virtual time. Sensors fall silent,
+//! and hub and gateway restart. Every received sample was sent, every lost one is counted, and no verdict is valid too long.
 
 #[path = "../../../tests/world/src/network.rs"]
 mod network;
@@ -22,9 +22,9 @@ use sending::{HUB, Key, Mishaps, NAMES, PERIOD_NS, Sending, Sent};
 
 const MS: Nanos = 1_000_000;
 const SECOND: Nanos = 1000 * MS;
-/// So long things go wrong.
+/// Time during which faults occur.
 const RUN: Nanos = 20 * SECOND;
-/// What the gateway is called.
+/// Name of the gateway.
 const NAME: &str = "robot1";
 
 /// One run, by its seed.
@@ -33,14 +33,14 @@ struct Run {
     faults: Faults,
     mishaps: Mishaps,
     every: u64,
-    /// The longest datagram: of some runs so short that all samples go in parts.
+    /// Maximum length of a datagram. In some runs, it is so short that all samples are sent in parts.
     longest: usize,
-    /// The listener does not run at times.
+    /// Whether the listener is stopped from time to time.
     stalls: bool,
 }
 
 impl Run {
-    /// Half of what can go wrong does, another half in each run.
+    /// Chooses the faults of a run: each kind occurs in half of the runs.
     fn new(seed: u64) -> Run {
         let mut rng = Rng::with_seed(seed);
         let mut some = |most: f64| if rng.bool() { rng.f64() * most } else { 0.0 };
@@ -57,8 +57,8 @@ impl Run {
         Run { seed, faults, mishaps, every, longest, stalls }
     }
 
-    /// What `docs/topics.md` promises: two periods as sent and 40 ms, half a second at least, 5.04 s at most. The period is told
-    /// by arrivals, so that it is longer by what the way took longer, and by pauses that the sensors made.
+    /// Returns how long a verdict is valid at most, as `docs/topics.md` promises: two periods of sending and 40 ms, at least 0.5 s
+    /// and at most 5.04 s. The period is estimated from arrivals, so delays of the network and pauses of the sensors extend it.
     fn promised_ns(&self) -> Nanos {
         match self.mishaps {
             Mishaps { silence: false, hub: false, .. } => {
@@ -68,8 +68,8 @@ impl Run {
         }
     }
 
-    /// One life of the gateway, in which no number is another sensor's.
-    fn is_one_count(&self) -> bool {
+    /// Returns whether the gateway never restarts, and the sensors keep their numbers.
+    fn has_one_sequence(&self) -> bool {
         !self.mishaps.gateway && !self.mishaps.order
     }
 }
@@ -78,76 +78,76 @@ fn limit_ns(period_ns: Nanos) -> Nanos {
     (2 * period_ns + 40 * MS).max(500 * MS)
 }
 
-/// What the judges keep.
+/// Observations of a run, which every event is checked against.
 #[derive(Default)]
-struct Judged {
+struct Observations {
     delivered: u64,
     refused: u64,
-    /// Parts that made no sample whole.
+    /// Parts that did not complete a sample.
     parts: u64,
-    /// Numbers that were taken.
+    /// Sequence numbers that were received.
     taken: BTreeMap<Key, BTreeSet<u32>>,
-    again: u64,
-    /// By the sensor's number: which one it is, as the newest announcement says.
+    duplicate: u64,
+    /// Position of the sensor with each number, by the newest announcement.
     owners: BTreeMap<u8, usize>,
-    /// When the newest zones of each sensor came.
+    /// Time of arrival of the newest zones of each sensor.
     heard_at: [Option<Nanos>; NAMES.len()],
-    /// The number of the datagram with zones that have this number in `nearest_mm`.
+    /// Sequence number of the datagram with the zones that have this value in `nearest_mm`.
     sequences: BTreeMap<u32, u64>,
     /// Samples of zones that were published.
     count: u64,
-    /// The last published zones of each sensor.
+    /// Last published zones of each sensor.
     published: [Option<Published>; NAMES.len()],
     longest_ns: Nanos,
     /// Datagrams with zones that were numbered.
     sent: u64,
-    /// Samples that were not published, by the reason.
+    /// Samples that were not published, by reason.
     left_out: [u64; 5],
-    /// Samples that were published as another sensor's.
+    /// Samples that were published under the name of another sensor.
     mistaken: u64,
 }
 
-impl Judged {
-    fn see(&mut self, seen: Seen<'_>, sent: &Sent, run: &Run) {
+impl Observations {
+    fn on_event(&mut self, seen: Seen<'_>, sent: &Sent, run: &Run) {
         match seen {
-            Seen::Datagram { came, bytes, arrived } => self.datagram(came, bytes, arrived, sent),
+            Seen::Datagram { arrived_at, bytes, arrived } => self.datagram(arrived_at, bytes, arrived, sent),
             Seen::Published(published) => self.publish(published, sent, run),
         }
     }
 
-    fn datagram(&mut self, came: Nanos, bytes: &[u8], arrived: &Arrived<'_>, sent: &Sent) {
+    fn datagram(&mut self, arrived_at: Nanos, bytes: &[u8], arrived: &Arrived<'_>, sent: &Sent) {
         self.delivered += 1;
         if matches!(arrived, Arrived::Refused { .. }) {
             self.refused += 1;
             return;
         }
-        let head = Datagram::read(bytes).expect("what is not refused can be read").head;
+        let head = Datagram::read(bytes).expect("a datagram that was not refused is valid").head;
         let key = (head.epoch, head.sensor, head.topic);
         let was_sent = &sent.datagrams[&key][head.sequence as usize];
-        assert_eq!(was_sent[usize::from(head.part)].as_deref(), Some(bytes), "what is taken was sent");
+        assert_eq!(was_sent[usize::from(head.part)].as_deref(), Some(bytes), "a received datagram was sent");
         if let Arrived::Part = arrived {
             self.parts += 1;
             return;
         }
         let is_new = self.taken.entry(key).or_default().insert(head.sequence);
-        self.again += u64::from(!is_new);
+        self.duplicate += u64::from(!is_new);
         match arrived {
             Arrived::Sample(sample) => {
-                assert!(is_new, "no sample comes twice");
+                assert!(is_new, "no sample is received twice");
                 let sent = was_sent.iter().flatten().flat_map(|part| &part[HEAD..]);
-                assert!(sent.eq(sample.remote.payload.bytes), "no sample is half of one");
+                assert!(sent.eq(sample.remote.payload.bytes), "samples are complete");
                 let is_zones = sample.remote.topic == Topic::Zones && !sample.remote.late;
                 let zones = is_zones.then(|| sample.remote.payload.unpack::<Zones>()).flatten();
                 if let Some(zones) = zones.filter(|_| is_zones) {
                     self.sequences.insert(zones.nearest_mm, head.sequence.into());
                     if let Some(owner) = self.owners.get(&head.sensor) {
-                        self.heard_at[*owner] = Some(came);
+                        self.heard_at[*owner] = Some(arrived_at);
                     }
                 }
             }
             Arrived::Announced(announced) => {
                 let owner = NAMES.iter().position(|name| *name == announced.announce.sensor());
-                self.owners.insert(head.sensor, owner.expect("one of them"));
+                self.owners.insert(head.sensor, owner.expect("a known sensor"));
             }
             _ => {}
         }
@@ -156,53 +156,56 @@ impl Judged {
     fn publish(&mut self, published: Published, sent: &Sent, run: &Run) {
         let Published { position, header, zones } = published;
         self.count += 1;
-        // What stands for a silence does not say whose it is.
+        // Zones of a silence do not contain the position of their sensor.
         if zones.nearest_mm != Zones::NO_DISTANCE && usize::from(zones.invalid_beams) != position {
-            // Datagrams do not say of which life of the hub they are: the announcement of a new one may be lost or overtaken.
+            // Datagrams do not name the hub's run, and its announcement may be lost or overtaken.
             let is_known = sent.boots[zones.nearest_mm as usize] == header.boot;
-            assert!(!is_known, "no sensor's samples are another's");
+            assert!(!is_known, "samples are published under the name of their sensor");
             self.mistaken += 1;
         }
-        if run.is_one_count() && zones.nearest_mm != Zones::NO_DISTANCE {
-            assert_eq!(header.topic_seq, self.sequences[&zones.nearest_mm], "the number is the datagram's");
+        if run.has_one_sequence() && zones.nearest_mm != Zones::NO_DISTANCE {
+            assert_eq!(
+                header.topic_seq, self.sequences[&zones.nearest_mm],
+                "the sequence number of the datagram"
+            );
         }
         let before = self.published[position].replace(published);
-        assert!(before.is_none_or(|before| before.header.topic_seq < header.topic_seq), "numbers grow");
+        assert!(before.is_none_or(|before| before.header.topic_seq < header.topic_seq), "numbers increase");
     }
 
-    /// What was so until `now`.
-    fn verdicts(&mut self, now: Nanos, run: &Run, receiving: &Receiving) {
+    /// Checks the verdicts that are valid until `now`.
+    fn check_verdicts(&mut self, now: Nanos, run: &Run, receiving: &Receiving) {
         for position in 0..NAMES.len() {
             if receiving.verdict(position) == Verdict::Unknown {
                 continue;
             }
-            let heard_at = self.heard_at[position].expect("nothing is known of what was not heard");
+            let heard_at = self.heard_at[position].expect("a verdict needs zones");
             self.longest_ns = self.longest_ns.max(now - heard_at);
             assert!(now - heard_at <= run.promised_ns(), "{position}: for {} ms", (now - heard_at) / MS);
             let Header { stamp_last_ns, period_us, .. } = self.published[position].expect("published").header;
-            let since = now - receiving.since_begin(stamp_last_ns);
+            let since = now - receiving.since_start(stamp_last_ns);
             assert!(since <= limit_ns(1000 * u64::from(period_us)), "{position}: {} ms", since / MS);
         }
     }
 }
 
-/// Plays `run` to its end, where all is well for two seconds.
-fn play(run: &Run) -> Judged {
+/// Plays `run`, and then two seconds without faults.
+fn play(run: &Run) -> Observations {
     let mut rng = Rng::with_seed(run.seed ^ 0x5eed);
     let mut network = Network::new(run.seed, run.faults);
     let mut sending = Sending::new(run.seed, run.mishaps, run.every, run.longest);
     let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
     let mut receiving = Receiving::new(clocks, NAME, &NAMES);
-    let mut judged = Judged::default();
+    let mut judged = Observations::default();
     let mut stall_at = if run.stalls { rng.u64(0..3 * SECOND) } else { Nanos::MAX };
     let (mut now, mut is_calm) = (0, false);
-    // A second in which all is well, and the last word, is heard at the end.
+    // After a second without faults, all announcements and zones have arrived.
     while now < RUN + 2 * SECOND {
-        judged.verdicts(now, run, &receiving);
+        judged.check_verdicts(now, run, &receiving);
         if now >= RUN && !is_calm {
             is_calm = true;
             stall_at = Nanos::MAX;
-            sending.calm(now);
+            sending.stop_faults(now);
             network.set_faults(Faults { delay_ns: run.faults.delay_ns, ..Faults::default() }, now);
         }
         if now >= stall_at {
@@ -211,33 +214,33 @@ fn play(run: &Run) -> Judged {
         }
         sending.step(now, &mut network);
         while let Some(bytes) = network.poll(now) {
-            receiving.catch(now, bytes);
+            receiving.deliver(now, bytes);
         }
-        receiving.step(now, NAME, |seen| judged.see(seen, &sending.sent, run));
+        receiving.step(now, NAME, |seen| judged.on_event(seen, &sending.sent, run));
         let due = [sending.next(now), receiving.next(now), network.next().unwrap_or(Nanos::MAX), stall_at];
         let next = due.into_iter().min().expect("some").max(now + 1);
         now = if is_calm { next } else { next.min(RUN) };
     }
     sending.announce(now, &mut network);
     while let Some(at) = network.next() {
-        let bytes = network.poll(at).expect("it came");
-        receiving.catch(at, bytes);
-        receiving.step(at, NAME, |seen| judged.see(seen, &sending.sent, run));
+        let bytes = network.poll(at).expect("it has arrived");
+        receiving.deliver(at, bytes);
+        receiving.step(at, NAME, |seen| judged.on_event(seen, &sending.sent, run));
     }
-    judge_account(&judged, &sending.sent, &receiving);
+    check_counters(&judged, &sending.sent, &receiving);
     let LeftOut { unnamed, unannounced, late, capacity, shortage, .. } = receiving.republisher.left_out;
     judged.left_out = [unnamed, unannounced, late, capacity, shortage];
     let zones = |(key, _): &(&Key, _)| key.2 == Topic::Zones.number();
     judged.sent = sending.sent.datagrams.iter().filter(zones).map(|(_, numbers)| numbers.len() as u64).sum();
     for position in 0..NAMES.len() {
-        assert_ne!(receiving.verdict(position), Verdict::Unknown, "where all is well something is known");
+        assert_ne!(receiving.verdict(position), Verdict::Unknown, "verdicts are known without faults");
     }
     judged
 }
 
-/// Of each epoch, sensor and topic what came, what is lost, what was sent before anything was known and what was sent behind
-/// all that is known is everything that was numbered.
-fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
+/// Checks the counters of each epoch, sensor and topic: received numbers, lost numbers, and those that were sent before the first or
+/// after the last known one are all numbers.
+fn check_counters(judged: &Observations, sent: &Sent, receiving: &Receiving) {
     let stats = receiving.incoming.gateways();
     let last = sent.datagrams.keys().map(|(epoch, ..)| *epoch).max();
     let (mut received, mut duplicate) = (0, 0);
@@ -250,7 +253,7 @@ fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
         assert!(known <= numbers, "{key:?}: {known} of {numbers}");
         if let Some((first, end)) = taken.and_then(|taken| Some((*taken.first()?, *taken.last()? + 1))) {
             assert!(known >= u64::from(end - first), "{key:?}");
-            // The last word was heard: nothing is sent behind it, and what is not known was sent before the first one.
+            // The last announcement has arrived, so only numbers before the first received one are unknown.
             if Some(row.epoch) == last && row.topic != 0 {
                 assert!(numbers - known <= u64::from(first), "{key:?}: {known} of {numbers}, from {first}");
             }
@@ -260,12 +263,16 @@ fn judge_account(judged: &Judged, sent: &Sent, receiving: &Receiving) {
     }
     assert_eq!((stats.evicted().runs, stats.refused(DatagramError::Stale)), (0, 0));
     let refused: u64 = DatagramError::ALL.iter().map(|&why| stats.refused(why)).sum();
-    assert_eq!((duplicate, refused), (judged.again, judged.refused));
-    assert_eq!(received + duplicate + refused + judged.parts, judged.delivered, "each is counted once");
+    assert_eq!((duplicate, refused), (judged.duplicate, judged.refused));
+    assert_eq!(
+        received + duplicate + refused + judged.parts,
+        judged.delivered,
+        "each datagram is counted once"
+    );
 }
 
 #[test]
-fn what_comes_was_sent_and_what_does_not_is_counted() {
+fn received_samples_were_sent_and_lost_ones_are_counted() {
     let mut sums = [0; 3];
     let (mut longest, mut mistaken) = ((0, 0), 0);
     let (from, to) = match std::env::var("SEED").ok().and_then(|seed| seed.parse().ok()) {
@@ -279,25 +286,25 @@ fn what_comes_was_sent_and_what_does_not_is_counted() {
         let taken: usize = judged.taken.values().map(BTreeSet::len).sum();
         sums = [sums[0] + judged.delivered, sums[1] + judged.refused, sums[2] + taken as u64];
         longest = longest.max((judged.longest_ns, seed));
-        assert!(judged.mistaken == 0 || run.mishaps.order, "sensors stay in their order");
+        assert!(judged.mistaken == 0 || run.mishaps.order, "the sensors keep their order");
         mistaken += judged.mistaken;
     }
-    eprintln!("published as another sensor's until the hub's life was announced: {mistaken}");
+    eprintln!("published under the name of another sensor until the hub's run was announced: {mistaken}");
     eprintln!(
-        "delivered, refused, taken: {sums:?}; a verdict stood for {} ms at most: {}",
+        "delivered, refused, taken: {sums:?}; a verdict was valid for {} ms at most: {}",
         longest.0 / MS,
         longest.1
     );
 }
 
 #[test]
-fn a_network_without_faults_carries_everything() {
+fn network_without_faults_loses_nothing() {
     for every in [1, 4] {
         let faults = Faults { delay_ns: MS, ..Faults::default() };
         let mishaps = Mishaps::default();
         let judged = play(&Run { seed: 1, faults, mishaps, every, longest: HEAD + 5, stalls: false });
         assert!(judged.parts > judged.sent);
-        assert_eq!((judged.left_out, judged.refused, judged.again), ([0; 5], 0, 0));
+        assert_eq!((judged.left_out, judged.refused, judged.duplicate), ([0; 5], 0, 0));
         assert_eq!(judged.count, judged.sent);
         assert!(judged.longest_ns <= every * PERIOD_NS, "{} ms", judged.longest_ns / MS);
     }

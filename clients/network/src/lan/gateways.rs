@@ -125,16 +125,16 @@ pub struct EvictedTotals {
     pub no_room: u64,
 }
 
-/// What the table knows about a datagram that it accepted.
+/// Result of accepting a datagram.
 pub(super) struct Accepted {
     pub(super) fresh: Fresh,
-    /// Whether a run of the gateway begins with it.
+    /// Whether a run of the gateway begins with the datagram.
     pub(super) begins: bool,
     /// Samples that were sent since the one before it and have not arrived.
     pub(super) missed: u32,
     /// Bytes of memory that the payload fills.
     pub(super) room: usize,
-    /// The announcement, if it is one.
+    /// Content of an announcement; `None` for a sample.
     pub(super) announce: Option<Announce>,
 }
 
@@ -646,7 +646,7 @@ impl Standing {
         !is_busy || arrival.delivers && !self.is_proven()
     }
 
-    /// Returns the time until which the run counts as active. Of the runs that may be evicted, the one with the lowest
+    /// Returns the time until which the run counts as active. Among the runs that may be evicted, the one with the lowest
     /// value is evicted first.
     pub(super) fn worth_ns(&self) -> u64 {
         match self.delivered_ns {
@@ -1102,7 +1102,7 @@ mod tests {
     }
 
     #[test]
-    fn evicted_gateways_keep_their_counters_and_clock_reports() {
+    fn evicted_gateways_keep_counters_and_clock_reports() {
         let mut table = GatewayTable::new(&Topic::ALL);
         let differing = |hub, epoch| Head { stamp_ns: 3_000 * MS, ..head(hub, epoch, 0) };
         let announce = |table: &mut GatewayTable, hub, epoch, at_ms| {
@@ -1129,7 +1129,7 @@ mod tests {
     }
 
     #[test]
-    fn successor_of_a_silent_gateway_does_not_reorder_retired_runs() {
+    fn successor_of_a_gateway_keeps_order_of_retired_runs() {
         let mut table = GatewayTable::new(&Topic::ALL);
         for (hub, epoch) in [(5, 1), (5, 2), (6, 1), (6, 2)] {
             assert_eq!(at(&mut table, &zones(head(hub, epoch, 0)), 0), Ok(Fresh::New));

@@ -1,9 +1,9 @@
 //! The receiving end of a network: each datagram is refused, recorded in the table of gateways, or becomes a new sample
 //! with everything that is known about its sender.
 //!
-//! With a key, only datagrams that are authenticated with it are accepted, and none that was recorded and is sent again: a
-//! sensor is accepted once an announcement arrives that was sent just now by this machine's clock. From then on, sequence
-//! numbers only increase.
+//! With a key, only datagrams that are authenticated with it are accepted. A recording of such datagrams is refused when it is
+//! sent again: a sensor is accepted once an announcement arrives that was sent just now, by this machine's clock. From then
+//! on, sequence numbers only increase.
 
 use std::collections::HashMap;
 
@@ -40,7 +40,7 @@ pub enum Arrived<'a> {
     /// The datagram was refused: it is the first announcement of a sensor and is authenticated, but its stamp is off.
     /// The clocks differ, or it was recorded.
     Untimely {
-        /// By how much the stamp is behind this machine's clock, in ns.
+        /// This machine's clock minus the stamp, in ns.
         behind_ns: i64,
     },
     /// The datagram comes from a gateway that is not received. It is not counted.
@@ -69,7 +69,7 @@ pub struct Announcement {
     pub begins: bool,
     /// Whether the sensor was printed under its number before, and has this name now.
     pub is_named: bool,
-    /// By how much the gateway's clock is behind this machine's, in ns, if they differ. Reported once for each gateway.
+    /// This machine's clock minus the gateway's, in ns, if they differ. Reported once for each gateway.
     pub behind_ns: Option<i64>,
     /// Whether its gateway has the key, or has delivered samples for a second or more.
     pub is_proven: bool,
@@ -101,11 +101,11 @@ pub struct CheckedPayload<'a> {
 /// A sample of another machine.
 #[derive(Clone, Copy)]
 pub struct Remote<'a> {
-    /// Its topic.
+    /// Topic of the sample.
     pub topic: Topic,
     /// Header of its datagram.
     pub head: Head,
-    /// Its payload.
+    /// Payload of the sample.
     pub payload: CheckedPayload<'a>,
     /// Run of its hub; 0 if unknown.
     pub boot: u64,
@@ -206,8 +206,8 @@ impl Incoming {
         self.gateways.printed_name(head)
     }
 
-    /// Handles `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
-    /// have, for example its address and port. A sample that came in parts is written to `whole` once it is complete.
+    /// Handles `bytes`, a whole datagram that arrived at `arrival`. `from` identifies the sender, for example by its address and
+    /// port. A sample that was sent in parts is written to `whole` once it is complete.
     pub fn receive<'a>(
         &mut self,
         bytes: &'a [u8],

@@ -34,7 +34,7 @@ const MAX_OF_TOPIC: usize = 4;
 const MAX_OF_ALL: usize = 64;
 
 impl Reassembler {
-    /// Takes a part that came `from` a sender. `is_known` says whether its sample is a duplicate. Once the sample is complete,
+    /// Takes a part from the sender `from`. `is_known` says whether its sample is a duplicate. Once the sample is complete,
     /// writes it to `whole`, and returns its header.
     pub(super) fn take(
         &mut self,
@@ -108,19 +108,19 @@ mod tests {
         Head { topic: 2, hub: 5, sequence, parts: 3, ..Head::default() }
     }
 
-    /// Takes part number `part` of `head`, which says who it is; what is whole then.
+    /// Takes part number `part` of the sample with `head`. Returns the sample once it is complete.
     fn take(parts: &mut Reassembler, head: Head, part: u8, from: u64) -> Option<Vec<u8>> {
         let (payload, mut whole) = ([head.sequence as u8, part].repeat(usize::from(part) + 1), vec![9]);
         let datagram = Datagram { head: Head { part, ..head }, payload: &payload, mac: None };
-        let told = parts.take(&datagram, from, false, &mut whole)?;
-        assert_eq!(told, Head { parts: 1, ..head });
+        let taken = parts.take(&datagram, from, false, &mut whole)?;
+        assert_eq!(taken, Head { parts: 1, ..head });
         Some(whole)
     }
 
     const WHOLE: [u8; 12] = [7, 0, 7, 1, 7, 1, 7, 2, 7, 2, 7, 2];
 
     #[test]
-    fn parts_in_any_order_and_some_twice_are_one_sample() {
+    fn reassembles_parts_in_any_order_and_duplicates() {
         for order in [&[0, 1, 2][..], &[2, 1, 0], &[1, 1, 2, 1, 0], &[2, 0, 0, 2, 1]] {
             let mut parts = Reassembler::default();
             let (last, first) = order.split_last().unwrap();
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_made_of_parts_of_two() {
+    fn never_mixes_parts_of_two_samples() {
         let mut parts = Reassembler::default();
         take(&mut parts, head(7), 0, 1);
         take(&mut parts, head(7), 1, 1);
@@ -146,8 +146,8 @@ mod tests {
         ] {
             assert_eq!(take(&mut parts, other, 2, from), None, "{other:?}");
         }
-        assert!(take(&mut parts, head(7), 2, 1).is_some(), "none of them is in the way");
-        // Of one number that says two things nothing is left of the first.
+        assert!(take(&mut parts, head(7), 2, 1).is_some(), "none of them replaced it");
+        // A second sample with the same number replaces the first one.
         take(&mut parts, head(9), 0, 1);
         for other in
             [Head { counter: 1, ..head(9) }, Head { stamp_ns: 1, ..head(9) }, Head { parts: 4, ..head(9) }]

@@ -36,19 +36,19 @@ pub struct Republisher<S: TopicStore> {
 /// Samples that were received and not published, by reason.
 #[derive(Clone, Copy, Default)]
 pub struct LeftOut {
-    /// Their sensor has no name, because it is not announced yet.
+    /// The sensor has no name, because it is not announced yet.
     pub unnamed: u64,
-    /// Their sensor's announcement does not name their topic.
+    /// The sensor's announcement does not name the topic.
     pub unannounced: u64,
     /// A newer sample was published before.
     pub late: u64,
-    /// Their sensor is beyond the [`MAX_SENSORS`] for which there is room.
+    /// There are [`MAX_SENSORS`] other sensors.
     pub capacity: u64,
-    /// There was no memory or no descriptor for their topic.
+    /// There was no memory or no descriptor for the topic.
     pub shortage: u64,
-    /// Their gateway is not known to deliver yet.
+    /// The gateway is not known to deliver yet.
     pub unproven: u64,
-    /// Their sensor or topic did not fit into the memory that remote sensors may use.
+    /// The sensor or topic did not fit into the memory that remote sensors may use.
     pub no_room: u64,
 }
 
@@ -291,7 +291,7 @@ impl<S: TopicStore> Republisher<S> {
         *reason += 1;
     }
 
-    /// Returns the position of the sensor that is evicted next for another one.
+    /// Returns the index of the sensor that is evicted next for another one.
     fn next_evicted(&self, arrival: Arrival) -> Option<usize> {
         let may_go = |at: &usize| self.sensors[*at].standing.may_go(arrival);
         (0..self.sensors.len()).filter(may_go).min_by_key(|&at| self.sensors[at].standing.worth_ns())

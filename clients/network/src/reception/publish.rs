@@ -16,7 +16,7 @@ use crate::lan::republish::{Republisher, SensorTopics, TopicStore};
 /// Publisher of all remote sensors in a domain.
 pub(super) type Publication = Republisher<SharedMemory>;
 
-/// Shared memory of a domain, of which remote sensors may use a part.
+/// Shared memory of a domain, with a budget for remote sensors.
 pub(super) struct SharedMemory {
     session: PublishSession,
     budget: Rc<Budget>,

@@ -126,7 +126,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{hub}.#{number} is {hub}.{sensor}"))
     }
 
-    /// Reports by how much the clock of the gateway that sent `head` is behind this machine's.
+    /// Reports that the clock of the gateway that sent `head` lags this machine's by `behind_ns`, or leads if negative.
     pub(super) fn clocks_differ(&mut self, head: &Head, behind_ns: i64) -> Result<(), End> {
         let behind_ms = behind_ns as f64 / 1e6;
         if self.json {
@@ -194,7 +194,7 @@ impl<'a> Report<'a> {
         self.write_counters(gateways, &[])
     }
 
-    /// Prints the counters, over those on the terminal if there are any. `others` are further reasons for which datagrams
+    /// Prints the counters. On a terminal, draws over the previous ones. `others` are further reasons for which datagrams
     /// were refused.
     pub(super) fn stats(
         &mut self,

@@ -1,5 +1,5 @@
-//! A machine with a listener that publishes, and a robot's verdict of what it publishes, in virtual time. Topics are queues in
-//! memory. Refuses to know what was sent.
+//! A machine with a listener that publishes, and a robot that subscribes to the zones, in virtual time. Topics are queues in
+//! memory.
 
 use std::collections::VecDeque;
 
@@ -15,44 +15,44 @@ use scanhub_schema::{Header, Topic, Verdict, Zones};
 use crate::network::Nanos;
 use crate::remote_topics::{self, Memory};
 
-/// The machine.
+/// Receiving machine.
 pub(crate) struct Receiving {
-    /// Its clocks at the begin.
+    /// Clocks at the start.
     clocks: Stamp,
     pub(crate) incoming: Incoming,
     pub(crate) republisher: Republisher<Memory>,
     memory: Memory,
-    /// Datagrams that the kernel has, with the time at which they came.
+    /// Datagrams in the kernel's buffer, with the time of their arrival.
     queue: VecDeque<(Nanos, Vec<u8>)>,
-    /// The listener does not run until then.
+    /// Time until which the listener is stopped.
     stalled_until: Nanos,
     look_at: Nanos,
     pub(crate) robot: Robot,
     followed: Vec<(String, ZonesState)>,
 }
 
-/// A sample that was published of topic zones.
+/// A published sample of topic zones.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Published {
-    /// Which one of the sensors that are followed.
+    /// Position of its sensor.
     pub(crate) position: usize,
     pub(crate) header: Header,
     pub(crate) zones: Zones,
 }
 
-/// What is seen from outside of a datagram that was taken.
+/// Event that a test observes.
 pub(crate) enum Seen<'a> {
-    Datagram { came: Nanos, bytes: &'a [u8], arrived: &'a Arrived<'a> },
+    Datagram { arrived_at: Nanos, bytes: &'a [u8], arrived: &'a Arrived<'a> },
     Published(Published),
 }
 
-/// The process that publishes.
+/// ID of the publishing process.
 const PID: u32 = 77;
-/// The listener's longest sleep.
-const LOOK_EVERY_NS: Nanos = 100_000_000;
+/// Maximum sleep of the listener.
+const MAX_SLEEP_NS: Nanos = 100_000_000;
 
 impl Receiving {
-    /// Follows the zones of `names` of the gateway that is called so.
+    /// Creates a machine whose robot subscribes to the zones of `names` of gateway `hub`.
     pub(crate) fn new(clocks: Stamp, hub: &str, names: &[&str]) -> Receiving {
         let memory = Memory::default();
         let mut receiving = Receiving {
@@ -74,17 +74,17 @@ impl Receiving {
         receiving
     }
 
-    /// The kernel has a datagram, that came now.
-    pub(crate) fn catch(&mut self, now: Nanos, bytes: Vec<u8>) {
+    /// Puts a datagram that arrives now into the kernel's buffer.
+    pub(crate) fn deliver(&mut self, now: Nanos, bytes: Vec<u8>) {
         self.queue.push_back((now, bytes));
     }
 
-    /// The listener does not run until `until`.
+    /// Stops the listener until `until`.
     pub(crate) fn stall(&mut self, until: Nanos) {
         self.stalled_until = until;
     }
 
-    /// When something happens next by itself.
+    /// Returns the time of the next event without a datagram.
     pub(crate) fn next(&self, now: Nanos) -> Nanos {
         let moment = self.moment(now);
         let left = self.followed.iter().filter_map(|(_, state)| state.left(moment));
@@ -92,14 +92,14 @@ impl Receiving {
         silence_at.min(self.look_at.max(self.stalled_until))
     }
 
-    /// Takes what waits, and shows it.
+    /// Handles waiting datagrams, and calls `seen` with each event.
     pub(crate) fn step(&mut self, now: Nanos, hub: &str, mut seen: impl FnMut(Seen<'_>)) {
         if now >= self.stalled_until {
             let wall = self.stamp(now);
-            while let Some((came, bytes)) = self.queue.pop_front() {
-                let (arrival, mut whole) = (self.stamp(came), Vec::new());
+            while let Some((arrived_at, bytes)) = self.queue.pop_front() {
+                let (arrival, mut whole) = (self.stamp(arrived_at), Vec::new());
                 let arrived = self.incoming.receive(&bytes, 1, arrival, &mut whole);
-                seen(Seen::Datagram { came, bytes: &bytes, arrived: &arrived });
+                seen(Seen::Datagram { arrived_at, bytes: &bytes, arrived: &arrived });
                 if let Some(head) = arrived.begins() {
                     self.republisher.begun(head, wall);
                 }
@@ -112,14 +112,14 @@ impl Receiving {
             }
             self.republisher.wake();
             if now >= self.look_at {
-                self.look_at = now + LOOK_EVERY_NS;
+                self.look_at = now + MAX_SLEEP_NS;
                 self.republisher.look(wall.monotonic_ns, wall);
             }
         }
         self.follow(now, seen);
     }
 
-    /// The consumer takes what is published, and sees what is not.
+    /// Receives the published zones, and detects silences.
     fn follow(&mut self, now: Nanos, mut seen: impl FnMut(Seen<'_>)) {
         let moment = self.moment(now);
         for (position, (name, state)) in self.followed.iter_mut().enumerate() {
@@ -138,13 +138,13 @@ impl Receiving {
         }
     }
 
-    /// The verdict of the sensor at this position.
+    /// Returns the verdict of the sensor at this position.
     pub(crate) fn verdict(&self, position: usize) -> Verdict {
         self.robot.sensors().nth(position).expect("it is followed").1
     }
 
-    /// Since the begin, of a stamp of CLOCK_MONOTONIC here.
-    pub(crate) fn since_begin(&self, stamp_ns: u64) -> Nanos {
+    /// Returns the time from the start to a stamp of CLOCK_MONOTONIC.
+    pub(crate) fn since_start(&self, stamp_ns: u64) -> Nanos {
         stamp_ns.checked_sub(self.clocks.monotonic_ns).expect("a stamp of this machine")
     }
 

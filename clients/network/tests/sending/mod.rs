@@ -1,5 +1,5 @@
-//! A machine with a hub of two sensors and a gateway, in virtual time: sensors fall silent, hub and gateway start again. Keeps
-//! what was sent. Refuses to know what becomes of it.
+//! A machine with a hub of two sensors and a gateway, in virtual time. Sensors fall silent, and hub and gateway restart. Keeps
+//! everything that was sent.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU64;
@@ -14,44 +14,44 @@ use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
 
 use crate::network::{Nanos, Network};
 
-/// What goes wrong here.
+/// Faults of the sending machine.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Mishaps {
-    /// Sensors fall silent.
+    /// Whether sensors fall silent.
     pub(crate) silence: bool,
-    /// The hub starts again.
+    /// Whether the hub restarts.
     pub(crate) hub: bool,
-    /// When it does, its sensors may be in another order.
+    /// Whether a restart of the hub may change the order of its sensors.
     pub(crate) order: bool,
-    /// The gateway starts again.
+    /// Whether the gateway restarts.
     pub(crate) gateway: bool,
-    /// The kernel does not take so many of what is sent, from 0 to 1.
+    /// Probability that the kernel refuses a datagram.
     pub(crate) refusal: f64,
 }
 
-/// The gateway's number.
+/// Number of the gateway.
 pub(crate) const HUB: u64 = 0xab;
-/// The sensors. The zones of the one at position n say n in `invalid_beams`.
+/// Names of the sensors. Zones of the sensor at position n have n in `invalid_beams`.
 pub(crate) const NAMES: [&str; 2] = ["front", "rear"];
-/// Between two scans.
+/// Time between two scans.
 pub(crate) const PERIOD_NS: Nanos = 26_640_000;
 const SECOND_NS: Nanos = 1_000_000_000;
-/// The hub says so long after the last scan that nothing is known.
+/// Time after the last scan at which the hub publishes an unknown verdict.
 const UNKNOWN_AFTER_NS: Nanos = 2 * PERIOD_NS + 20_000_000;
 const NEVER: Nanos = Nanos::MAX;
 
-/// The machine.
+/// Sending machine.
 pub(crate) struct Sending {
     rng: Rng,
     mishaps: Mishaps,
-    /// Every how manieth sample goes out.
+    /// Thinning factor of zones.
     every: u64,
     longest: usize,
-    /// CLOCK_MONOTONIC and the wall clock at the begin: they are not those of others.
+    /// Clocks at the start, which differ from those of other machines.
     clocks: Stamp,
     boot: u64,
-    hub: Turns,
-    gateway: Turns,
+    hub: Process,
+    gateway: Process,
     sensors: [Sensor; 2],
     outgoing: Outgoing,
     epoch: u32,
@@ -59,39 +59,40 @@ pub(crate) struct Sending {
     pub(crate) sent: Sent,
 }
 
-/// When something that runs ends, and begins again.
-struct Turns {
+/// A program that is stopped and restarted.
+struct Process {
     runs: bool,
+    /// Time at which it is stopped or started.
     at: Nanos,
 }
 
 struct Sensor {
-    /// Its position in the hub's configuration.
+    /// Number of the sensor, its position in the hub's configuration.
     number: u8,
     seq: u64,
     verdict: Verdict,
     scan_at: Nanos,
     unknown_at: Nanos,
     status_at: Nanos,
-    /// What the gateway knows of its zones.
+    /// State of its zones in the gateway.
     state: ZonesState,
 }
 
-/// Epoch, sensor's number and topic's.
+/// Epoch, number of the sensor, and number of the topic.
 pub(crate) type Key = (u32, u8, u8);
-/// The datagrams of a sample: what was handed to the network, or nothing where the kernel did not take it.
+/// Datagrams of a sample; `None` for a datagram that the kernel refused.
 pub(crate) type Parts = Vec<Option<Vec<u8>>>;
 
 /// Everything that was sent.
 #[derive(Default)]
 pub(crate) struct Sent {
-    /// The samples by their numbers.
+    /// Samples of each stream, by their sequence numbers.
     pub(crate) datagrams: BTreeMap<Key, Vec<Parts>>,
-    /// The life of the hub in which zones were made that have this number in `nearest_mm`.
+    /// Run of the hub in which the zones with this value in `nearest_mm` were published.
     pub(crate) boots: Vec<u64>,
 }
 
-/// The way to the network.
+/// Connection from the gateway to the network.
 struct Uplink<'a> {
     now: Nanos,
     rng: &'a mut Rng,
@@ -105,23 +106,22 @@ impl Transmit for Uplink<'_> {
         let head = Datagram::read(datagram).expect("a whole datagram").head;
         let numbers = self.sent.datagrams.entry((head.epoch, head.sensor, head.topic)).or_default();
         if head.part == 0 {
-            assert_eq!(numbers.len(), head.sequence as usize, "numbers are without gaps");
+            assert_eq!(numbers.len(), head.sequence as usize, "numbers have no gaps");
             numbers.push(Vec::new());
         }
-        let is_taken = self.rng.f64() >= self.refusal;
-        let parts = numbers.last_mut().expect("the first part goes out first");
+        let is_sent = self.rng.f64() >= self.refusal;
+        let parts = numbers.last_mut().expect("the first part is sent first");
         assert_eq!(parts.len(), usize::from(head.part));
-        parts.push(is_taken.then(|| datagram.to_vec()));
-        if is_taken {
+        parts.push(is_sent.then(|| datagram.to_vec()));
+        if is_sent {
             self.network.send(self.now, datagram);
         }
-        is_taken
+        is_sent
     }
 }
 
 impl Sending {
-    /// Of zones every so many go out.
-    /// In datagrams of `longest` bytes at most.
+    /// Creates a machine that sends every `every`th sample of zones, in datagrams of at most `longest` bytes.
     pub(crate) fn new(seed: u64, mishaps: Mishaps, every: u64, longest: usize) -> Sending {
         let mut rng = Rng::with_seed(seed);
         let clocks = Stamp { monotonic_ns: rng.u64(1..1 << 50), wall_ns: rng.u64(1 << 60..1 << 61) };
@@ -131,8 +131,8 @@ impl Sending {
             every,
             clocks,
             boot: 0,
-            hub: Turns { runs: false, at: 0 },
-            gateway: Turns { runs: false, at: 0 },
+            hub: Process { runs: false, at: 0 },
+            gateway: Process { runs: false, at: 0 },
             sensors: [0, 1].map(|number| Sensor::new(number, moment(clocks, 0))),
             outgoing: gateway(epoch, every, longest),
             longest,
@@ -141,13 +141,13 @@ impl Sending {
             sent: Sent::default(),
             rng,
         };
-        sending.turn_hub(0);
-        sending.turn_gateway(0);
+        sending.switch_hub(0);
+        sending.switch_gateway(0);
         sending
     }
 
-    /// From now on all runs, and nothing goes wrong.
-    pub(crate) fn calm(&mut self, now: Nanos) {
+    /// Starts everything that is stopped. No further faults occur.
+    pub(crate) fn stop_faults(&mut self, now: Nanos) {
         self.mishaps = Mishaps::default();
         for runs in [&mut self.hub, &mut self.gateway] {
             runs.at = if runs.runs { NEVER } else { now };
@@ -157,37 +157,37 @@ impl Sending {
         }
     }
 
-    /// When something happens next.
+    /// Returns the time of the next event.
     pub(crate) fn next(&self, now: Nanos) -> Nanos {
-        let turns = self.hub.at.min(self.gateway.at);
+        let restart_at = self.hub.at.min(self.gateway.at);
         let announce_at = if self.gateway.runs { self.announce_at } else { NEVER };
         let of_sensors = self.sensors.iter().map(|sensor| {
             let left = sensor.state.left(moment(self.clocks, now)).filter(|_| self.gateway.runs);
             let silence_at = left.map_or(NEVER, |left| now + left.as_nanos() as Nanos);
-            let spoken_at = sensor.scan_at.min(sensor.unknown_at).min(sensor.status_at);
-            silence_at.min(if self.hub.runs { spoken_at } else { NEVER })
+            let publish_at = sensor.scan_at.min(sensor.unknown_at).min(sensor.status_at);
+            silence_at.min(if self.hub.runs { publish_at } else { NEVER })
         });
-        of_sensors.fold(turns.min(announce_at), Nanos::min)
+        of_sensors.fold(restart_at.min(announce_at), Nanos::min)
     }
 
     /// Does what is due.
     pub(crate) fn step(&mut self, now: Nanos, network: &mut Network) {
         if now >= self.hub.at {
-            self.turn_hub(now);
+            self.switch_hub(now);
         }
         if now >= self.gateway.at {
             self.end_gateway(now, network);
-            self.turn_gateway(now);
+            self.switch_gateway(now);
         }
         for position in 0..NAMES.len() {
             if self.hub.runs {
-                self.speak(position, now, network);
+                self.publish_due(position, now, network);
             }
             let moment = moment(self.clocks, now);
             if self.gateway.runs
                 && let Some(heard) = self.sensors[position].state.silence(moment)
             {
-                self.hand_over(position, None, PayloadRef::Zones(&heard.zones), now, network);
+                self.pass_to_gateway(position, None, PayloadRef::Zones(&heard.zones), now, network);
             }
         }
         if self.gateway.runs && now >= self.announce_at {
@@ -196,14 +196,14 @@ impl Sending {
         }
     }
 
-    /// Says who all sensors are, once more.
+    /// Announces all sensors.
     pub(crate) fn announce(&mut self, now: Nanos, network: &mut Network) {
         let Sending { rng, sent, outgoing, .. } = self;
         let mut uplink = Uplink { now, rng, refusal: self.mishaps.refusal, sent, network };
         outgoing.announce(stamp(self.clocks, now), &mut uplink);
     }
 
-    fn turn_hub(&mut self, now: Nanos) {
+    fn switch_hub(&mut self, now: Nanos) {
         self.hub.runs = !self.hub.runs;
         if !self.hub.runs {
             self.hub.at = now + self.rng.u64(30_000_000..2 * SECOND_NS);
@@ -222,7 +222,7 @@ impl Sending {
         }
     }
 
-    fn turn_gateway(&mut self, now: Nanos) {
+    fn switch_gateway(&mut self, now: Nanos) {
         self.gateway.runs = !self.gateway.runs;
         if !self.gateway.runs {
             self.gateway.at = now + self.rng.u64(10_000_000..2 * SECOND_NS);
@@ -237,15 +237,15 @@ impl Sending {
         self.sensors.iter_mut().for_each(|sensor| sensor.state = ZonesState::new(moment));
     }
 
-    /// Half of the gateways are killed; the others have a last word.
+    /// Kills half of the gateways. The others send a last announcement.
     fn end_gateway(&mut self, now: Nanos, network: &mut Network) {
         if self.gateway.runs && self.rng.bool() {
             self.announce(now, network);
         }
     }
 
-    /// What the hub publishes now of the sensor.
-    fn speak(&mut self, position: usize, now: Nanos, network: &mut Network) {
+    /// Publishes what is due of a sensor.
+    fn publish_due(&mut self, position: usize, now: Nanos, network: &mut Network) {
         let Sensor { scan_at, unknown_at, status_at, .. } = self.sensors[position];
         if now >= scan_at {
             let silent_ns = if self.mishaps.silence && self.rng.u8(..) == 0 {
@@ -271,7 +271,7 @@ impl Sending {
             let mut status = Status::default();
             status.set_sensor_type("LMS200");
             let header = self.header(position, now);
-            self.hand_over(position, Some(&header), PayloadRef::Status(&status), now, network);
+            self.pass_to_gateway(position, Some(&header), PayloadRef::Status(&status), now, network);
         }
     }
 
@@ -286,7 +286,7 @@ impl Sending {
         if self.gateway.runs {
             let (header, moment) = (self.header(position, now), moment(self.clocks, now));
             let heard = self.sensors[position].state.take(&header, &zones, 0, moment);
-            self.hand_over(position, Some(&header), PayloadRef::Zones(&heard.zones), now, network);
+            self.pass_to_gateway(position, Some(&header), PayloadRef::Zones(&heard.zones), now, network);
         }
     }
 
@@ -305,8 +305,8 @@ impl Sending {
         }
     }
 
-    /// Gives it to the gateway, if there is one.
-    fn hand_over(
+    /// Passes a sample to the gateway, if it runs.
+    fn pass_to_gateway(
         &mut self,
         position: usize,
         header: Option<&Header>,

@@ -65,7 +65,7 @@ struct Queue {
 pub struct Handed<'a> {
     /// Number of the sensor in the hub, and its name.
     pub sensor: (u8, &'a str),
-    /// Its topic; `None` for an announcement.
+    /// Topic of the sample; `None` for an announcement.
     pub topic: Option<Topic>,
     /// Whole datagram.
     pub datagram: &'a [u8],

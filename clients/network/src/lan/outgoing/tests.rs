@@ -72,7 +72,7 @@ fn send(out: &mut Outgoing, sensor: usize, header: Option<Header>, verdict: Verd
 }
 
 #[test]
-fn announces_each_run_of_the_hub_before_its_first_sample() {
+fn announces_each_run_of_the_hub_before_samples() {
     let mut out = outgoing(Form::Sealed);
     let front = out.follow("front", each);
     assert_eq!((out.position("front"), out.position("rear")), (Some(front), None));
@@ -109,7 +109,7 @@ fn thinned_samples_use_no_number_and_unknown_is_sent() {
 }
 
 #[test]
-fn warnings_are_thinned_like_zones_of_their_revolution() {
+fn warnings_are_thinned_like_their_zones() {
     let mut out = outgoing(Form::Sealed);
     let thinned = |topic| NonZeroU64::new(2).filter(|_| matches!(topic, Topic::Zones | Topic::Early));
     let front = out.follow("front", thinned);
@@ -138,7 +138,7 @@ fn warnings_are_thinned_like_zones_of_their_revolution() {
 }
 
 #[test]
-fn silence_is_sent_as_unknown_zones_of_the_last_sensor() {
+fn silence_is_sent_as_unknown_zones() {
     let mut out = outgoing(Form::Sealed);
     let (front, rear) = (out.follow("front", each), out.follow("rear", each));
     assert_eq!(send(&mut out, front, None, Verdict::Unknown), [], "no sample yet");

@@ -406,7 +406,7 @@ mod tests {
         assert_eq!(periods_ms(&[500, 400, 300]), [0, 0, 0], "a clock that is set back");
     }
 
-    /// Follows a stream whose samples are sent every `period_ms` for a minute, and of which one in `sent` arrives. Returns how
+    /// Follows a stream whose samples arrive every `period_ms` for a minute; one in `sent` samples arrives. Returns how
     /// often its verdict becomes unknown before the end, and how long after the end it does, in ms.
     fn follow(period_ms: u64, jitter_ms: u64, sent: u64) -> (u32, u64) {
         let (mut arrivals, mut freshness) = (PeriodEstimator::default(), Freshness::new(at(0)));
