@@ -1,5 +1,6 @@
-//! Measures the cost of checking the MAC of a scan, compared with its checksum alone: `cargo run --release -p scanhub-network --example mac_cost`.
-//! A scan of 361 beams is one datagram. One of 3,240 beams with exact angles is sent in parts. The fastest of many runs counts.
+//! Measures the cost of checking the MAC of a scan, compared with its checksum alone:
+//! `cargo run --release -p scanhub-network --example mac_cost`. A scan of 361 beams is one datagram. One of 3,240 beams
+//! with exact angles is sent in parts. The fastest of many runs counts.
 #![allow(clippy::print_stdout)]
 
 use std::hint::black_box;

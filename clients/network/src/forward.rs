@@ -1,5 +1,5 @@
-//! Subscribes to the sensors of a hub and passes their samples to a network: sensors as they appear, the absence of the hub, and
-//! the selection of topics.
+//! Subscribes to the sensors of a hub and passes their samples to a network: sensors as they appear, the absence of the
+//! hub, and the selection of topics.
 
 mod selection;
 
@@ -22,8 +22,8 @@ pub use selection::Selection;
 
 /// A network that takes samples.
 pub trait Carrier {
-    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent. Returns the
-    /// sensor's position.
+    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
+    /// Returns the sensor's position.
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize;
 
     /// Returns whether samples of this topic are needed.
@@ -87,8 +87,8 @@ impl Forwarder {
         Ok(more)
     }
 
-    /// Checks whether the hub has exited or started, which it reports to `tell`, and searches the sensors of a new one. Call it
-    /// after [`forward`](Forwarder::forward), because it takes longer.
+    /// Checks whether the hub has exited or started, which it reports to `tell`, and searches the sensors of a new one.
+    /// Call it after [`forward`](Forwarder::forward), because it takes longer.
     ///
     /// # Errors
     ///
@@ -185,7 +185,8 @@ struct Sensor {
 const BATCH_SIZE: usize = 32;
 
 impl Sensor {
-    /// Creates subscriptions to the selected topics that the sensor `may_have`, and to its status if it is announced with its type.
+    /// Creates subscriptions to the selected topics that the sensor `may_have`, and to its status if it is announced
+    /// with its type.
     fn new(
         name: &str,
         may_have: impl Fn(Topic) -> bool,
@@ -200,8 +201,8 @@ impl Sensor {
         Sensor { name: name.to_owned(), position, sources }
     }
 
-    /// Passes waiting samples to `carrier`, and returns whether there may be more. Attaches at most one subscriber in each round
-    /// over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
+    /// Passes waiting samples to `carrier`, and returns whether there may be more. Attaches at most one subscriber in
+    /// each round over all sensors, see `subscribed`, because that takes a thousand times as long as sending.
     ///
     /// # Errors
     ///

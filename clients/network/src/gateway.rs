@@ -1,5 +1,5 @@
-//! `scanhub gateway`: sends the hub's samples to a network as datagrams. It is an ordinary client, which continues when the hub,
-//! its links or the network fail and come back. It receives nothing from the network.
+//! `scanhub gateway`: sends the hub's samples to a network as datagrams. It is an ordinary client, which continues when
+//! the hub, its links or the network fail and come back. It receives nothing from the network.
 
 mod host;
 mod interface_monitor;
@@ -36,8 +36,8 @@ use udp_destination::{DestinationEvent, UdpDestination};
 /// Arguments of `scanhub gateway`. Those that are missing may come from section `gateway` of the configuration.
 #[derive(Args, Clone, Debug, Default)]
 pub struct GatewayArgs {
-    /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent to
-    /// groups, and --to must name hosts. lo: this machine only
+    /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent
+    /// to groups, and --to must name hosts. lo: this machine only
     #[arg(long, value_name = "NAME")]
     pub interface: Option<String>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
@@ -47,7 +47,8 @@ pub struct GatewayArgs {
     pub topics: Vec<String>,
     // In help texts, brackets are not links.
     #[allow(rustdoc::broken_intra_doc_links)]
-    /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be repeated
+    /// Host that gets copies, HOST:PORT or [IPV6]:PORT; a name is resolved again while the gateway runs. Can be
+    /// repeated
     #[arg(long, value_name = "HOST:PORT")]
     pub to: Vec<String>,
     /// Send only telegrams, without a header, each sensor on its own port
@@ -68,16 +69,16 @@ pub struct GatewayArgs {
 }
 
 impl GatewayArgs {
-    /// Sends until `stop` is set, even without hub or network. The counters go to `out` at the end and whenever `tell` is
-    /// set, and everything else to `notes` (stderr) if `out` is not JSON. Lines for which there is no room are dropped, so that a
-    /// slow reader delays only the end, by a second.
+    /// Sends until `stop` is set, even without hub or network. The counters go to `out` at the end and whenever `tell`
+    /// is set, and everything else to `notes` (stderr) if `out` is not JSON. Lines for which there is no room are
+    /// dropped, so that a slow reader delays only the end, by a second.
     ///
     /// # Errors
     ///
     /// Returns
     ///
-    /// - [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is not a
-    ///   host, a value is not valid, or the key file contains no key of this user alone,
+    /// - [`Kind::Configuration`] if the interface does not exist, neither an interface nor a host is named, a host or
+    ///   another value is not valid, or the key file contains no key that only this user can read,
     /// - [`Kind::Usage`] if there is no such topic,
     /// - [`Kind::NoTopic`] if the first hub has no such sensor,
     /// - [`Kind::Short`] if descriptors or memory are short,

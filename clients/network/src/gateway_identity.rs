@@ -1,5 +1,5 @@
-//! Identity of a gateway: a random number that it keeps from one start to the next, and an epoch that is greater than those
-//! of earlier runs. Two gateways of one hub have different numbers.
+//! Identity of a gateway: a random number that it keeps from one start to the next, and an epoch that is greater than
+//! those of earlier runs. Two gateways of one hub have different numbers.
 
 use std::fs::{File, Permissions};
 use std::hash::{BuildHasher, RandomState};
@@ -26,14 +26,15 @@ pub struct Life {
 }
 
 impl Life {
-    /// Begins a run of the gateway of `domain` on `interface` (or another word for its destination), or of another one if that
-    /// one is running. The number is kept in a file in `directory`, which is created if it does not exist. `now_s` is seconds
-    /// since 1970. A number that was kept on another `machine`, if that is known, belongs to another gateway.
+    /// Begins a run of the gateway of `domain` on `interface` (or another word for its destination), or of another one
+    /// if that one is running. The number is kept in a file in `directory`, which is created if it does not exist.
+    /// `now_s` is seconds since 1970. A number that was kept on another `machine`, if that is known, belongs to another
+    /// gateway.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Output`] if the file cannot be written, because listeners could not distinguish this run from the last
-    /// one, and [`Kind::Configuration`] if too many are running.
+    /// Returns [`Kind::Output`] if the file cannot be written, because listeners could not distinguish this run from
+    /// the last one, and [`Kind::Configuration`] if too many are running.
     fn begin(
         directory: &Path,
         domain: &str,
@@ -128,18 +129,20 @@ fn directory() -> Result<PathBuf, Failure> {
 /// Maximum number of gateways of one domain on one interface. More are started by mistake.
 const MAX_GATEWAYS: u32 = 16;
 
-/// Begins a run of the gateway of `domain` on this machine, now. `way` is its interface, or another word for its destination.
+/// Begins a run of the gateway of `domain` on this machine, now. `way` is its interface, or another word for its
+/// destination.
 ///
 /// # Errors
 ///
-/// Returns the same errors as `Life::begin`, and [`Kind::Configuration`] if the environment names no directory for its number.
+/// Returns the same errors as `Life::begin`, and [`Kind::Configuration`] if the environment names no directory for its
+/// number.
 pub fn begin_life(domain: &str, way: &str) -> Result<Life, Failure> {
     let now_s = clock::wall_ns() / 1_000_000_000;
     Life::begin(&directory()?, domain, way, now_s, machine(Path::new(MACHINE_ID)))
 }
 
-/// Returns a number that identifies this machine, a hash of its ID because the ID itself is confidential (machine-id(5)). `None`
-/// if the file at `path` is missing or contains no such ID.
+/// Returns a number that identifies this machine, a hash of its ID because the ID itself is confidential
+/// (machine-id(5)). `None` if the file at `path` is missing or contains no such ID.
 fn machine(path: &Path) -> Option<u64> {
     let text = regular::read_text(path, regular::LONGEST).ok()?;
     let id = text.trim_end();

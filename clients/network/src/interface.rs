@@ -72,8 +72,8 @@ pub(crate) fn named(name: &str) -> Result<Interface, Failure> {
 /// Returns whether a sender with `address` is on this machine. `false` if the system cannot list its addresses.
 pub(crate) fn is_of_this_machine(address: IpAddr) -> bool {
     let is_it = |entry: &InterfaceAddress| ipv4(entry).is_some_and(|own| own == address);
-    // A datagram to a group has no source address if it is sent by loopback on a machine without another address. None with
-    // such an address arrives from outside.
+    // A datagram to a group has no source address if it is sent by loopback on a machine without another address. None
+    // with such an address arrives from outside.
     address.is_loopback()
         || address.is_unspecified()
         || getifaddrs().is_ok_and(|mut all| all.any(|entry| is_it(&entry)))
@@ -131,8 +131,8 @@ impl InterfaceChanges {
         Ok(InterfaceChanges { socket, buffer: vec![0; MAX_MESSAGE_LEN], losses: CarrierLosses::default() })
     }
 
-    /// Reads all waiting notifications, and calls `on_lost` with each interface that was lost since the last call. Returns
-    /// whether anything has changed. Costs one system call if nothing has.
+    /// Reads all waiting notifications, and calls `on_lost` with each interface that was lost since the last call.
+    /// Returns whether anything has changed. Costs one system call if nothing has.
     pub(crate) fn read(&mut self, mut on_lost: impl FnMut(LostInterface)) -> bool {
         let mut any = false;
         loop {
@@ -182,8 +182,8 @@ fn request_links() -> [u8; HEADER + LINK_HEADER] {
     request
 }
 
-/// Number of times that each interface has lost its carrier. If that happens twice in a second, the kernel reports both losses
-/// at once when the carrier is back, and only this number shows them.
+/// Number of times that each interface has lost its carrier. If that happens twice in a second, the kernel reports both
+/// losses at once when the carrier is back, and only this number shows them.
 #[derive(Default)]
 struct CarrierLosses {
     /// By the interface's index.
@@ -243,8 +243,8 @@ fn loss_count(message: &[u8]) -> Option<u32> {
     }
 }
 
-/// Returns the first `len` bytes, and the rest, which starts at a multiple of 4. `None` if `bytes` is shorter, or if `len` has no
-/// room for the length itself.
+/// Returns the first `len` bytes, and the rest, which starts at a multiple of 4. `None` if `bytes` is shorter, or if
+/// `len` has no room for the length itself.
 fn cut(bytes: &[u8], len: usize) -> Option<(&[u8], &[u8])> {
     let first = bytes.get(..len).filter(|first| first.len() >= 4)?;
     Some((first, bytes.get(len.next_multiple_of(4)..).unwrap_or_default()))

@@ -1,4 +1,5 @@
-//! `scanhub key`: creates the file with the key that gateways and listeners share. Both read it only if no other user can read it.
+//! `scanhub key`: creates the file with the key that gateways and listeners share. Both read it only if no other user
+//! can read it.
 
 use std::fs::File;
 use std::io::Write;
@@ -80,8 +81,8 @@ fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> 
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to another user, can
-/// be read or written by others, or contains no key.
+/// Returns [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to
+/// another user, can be read or written by others, or contains no key.
 pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     let refuse = |what: String, hint: &str| {
         Failure::new(Kind::Configuration, format!("key file {}: {what}", path.display()), hint)

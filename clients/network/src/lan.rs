@@ -30,7 +30,8 @@ pub struct Stamp {
     pub wall_ns: u64,
 }
 
-/// Key that the gateways and listeners of one network share. Listeners accept every datagram that is authenticated with it.
+/// Key that the gateways and listeners of one network share. Listeners accept every datagram that is authenticated with
+/// it.
 #[derive(Clone)]
 pub struct Key(Hmac<Sha256>);
 
@@ -46,7 +47,8 @@ impl Key {
         Key(Hmac::new(&block.into()))
     }
 
-    /// Returns the MAC of `covered`, which is header and payload with a checksum of 0. It is the first half of HMAC-SHA256.
+    /// Returns the MAC of `covered`, which is header and payload with a checksum of 0. It is the first half of
+    /// HMAC-SHA256.
     pub fn mac(&self, covered: &[u8]) -> [u8; MAC] {
         let whole = self.0.clone().chain_update(covered).finalize().into_bytes();
         std::array::from_fn(|at| whole[at])

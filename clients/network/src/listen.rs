@@ -1,17 +1,16 @@
 //! `scanhub listen`: receives samples from gateways, prints or publishes them, and counts those that did not arrive.
 //!
-//! With `--publish`, a datagram takes this path. Each step calls the next one, from `Listener::receive_batch` on:
+//! With `--publish`, a datagram takes this path. `Listener::receive_batch` reads the socket and calls
+//! `Reception::take`, which runs all other steps in this order. Subscribers are woken after each batch.
 //!
 //! | step | code | work |
 //! |---|---|---|
-//! | socket | [`MulticastReceiver::receive`] | returns the bytes, the sender and the time of arrival |
-//! | header | [`Incoming::receive_named`](crate::lan::incoming::Incoming::receive_named) | checks length, checksum, `--hub` and the MAC |
-//! | parts | `Incoming::complete` | continues with the last part of a sample |
+//! | socket | `MulticastReceiver::receive` | returns the bytes, the sender and the time of arrival |
+//! | header | `Incoming::receive_named` | checks length, checksum and `--hub`, then the MAC if there is a key |
+//! | parts | `Incoming::complete` | waits for all parts of a sample, and continues with the last one |
 //! | gateway | `GatewayTable::take` | checks run, sender, sequence number and payload, and counts the sample |
 //! | sample | `Reception::on_sample` | prints the sample, or passes it on |
-//! | publisher | [`Republisher::sample`](crate::lan::republish::Republisher::sample) | copies it into the topic of its sensor |
-//!
-//! Subscribers are woken after each batch.
+//! | publisher | `Republisher::sample` | copies it into the topic of its sensor |
 
 mod multicast_receiver;
 
@@ -56,14 +55,15 @@ pub struct ListenArgs {
     /// Print only the counts: received, lost, duplicate, reordered, refused
     #[arg(long)]
     stats: bool,
-    /// Publish the samples in this machine's domain as HUB.SENSOR instead of printing them, so that all programs here can
-    /// use them like sensors of a hub
+    /// Publish the samples in this machine's domain as HUB.SENSOR instead of printing them, so that all programs here
+    /// can use them like sensors of a hub
     #[arg(long)]
     publish: bool,
     /// Places for consumers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     consumers: u16,
-    /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
+    /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is
+    /// refused
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
     #[command(flatten)]
@@ -74,12 +74,12 @@ pub struct ListenArgs {
 pub const LISTEN_SIGNALS: &str = "SIGUSR1: print the counts so far";
 
 impl ListenArgs {
-    /// Prints received samples to `out`, and the counters at the end and whenever `tell` is set. Everything else goes to
-    /// `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached, `stop` is set, or the reader has closed the
-    /// output.
+    /// Prints received samples to `out`, and the counters at the end and whenever `tell` is set. Everything else goes
+    /// to `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached, `stop` is set, or the reader has
+    /// closed the output.
     ///
-    /// With `--publish`, samples are published instead of printed, without a copy for each subscriber. Only one listener may
-    /// publish in a domain.
+    /// With `--publish`, samples are published instead of printed, without a copy for each subscriber. Only one
+    /// listener may publish in a domain.
     ///
     /// # Errors
     ///

@@ -1,5 +1,5 @@
-//! The receiving side of `listen` and of the bridge, whatever the network: each datagram is refused or counted, and a new
-//! sample is printed or published in this machine's domain. Each problem is reported once.
+//! The receiving side of `listen` and of the bridge, whatever the network: each datagram is refused or counted, and a
+//! new sample is printed or published in this machine's domain. Each problem is reported once.
 
 mod epochs;
 mod names;
@@ -37,8 +37,8 @@ pub struct Wanted<'a> {
     pub heard: Vec<Topic>,
     /// Names of gateways, `NAME=HUB`, in place of their 16 hex digits.
     pub names: &'a [String],
-    /// Gateways to receive from, by 16 hex digits or by one of `names`; empty: all. Datagrams of others are ignored, and not
-    /// counted.
+    /// Gateways to receive from, by 16 hex digits or by one of `names`; empty: all. Datagrams of others are ignored,
+    /// and not counted.
     pub hubs: &'a [String],
     /// Key that datagrams are authenticated with. Without it, all datagrams are accepted.
     pub key: Option<Key>,
@@ -111,12 +111,13 @@ const CLOCK_BEHIND: &str = "a gateway has the key, and its clock is more than 5 
 const MAX_REPORTED: usize = 16;
 
 impl<'a> Reception<'a> {
-    /// Opens a receiver. It prints to `out`, and everything but samples and counters to `notes` unless the output is `json`.
+    /// Opens a receiver. It prints to `out`, and everything but samples and counters to `notes` unless the output is
+    /// `json`.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not valid or the memory is too small for a
-    /// sensor, [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, and
+    /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if a name or hub is not valid or the memory is too small
+    /// for a sensor, [`Kind::DomainHeld`](scanhub_schema::Kind) if another listener publishes in the domain, and
     /// [`Kind::Short`](scanhub_schema::Kind) if memory is short.
     pub fn open(
         wanted: Wanted<'_>,
@@ -358,8 +359,8 @@ struct Evictions {
     samples: u64,
 }
 
-/// Reports at the first eviction, and then from time to time, how many there were. Someone may cause them a thousand times a
-/// second.
+/// Reports at the first eviction, and then from time to time, how many there were. Someone may cause them a thousand
+/// times a second.
 #[derive(Default)]
 struct CapacityReporter {
     reported: Evictions,

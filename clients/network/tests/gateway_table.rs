@@ -1,5 +1,5 @@
-//! Compares the table of gateways with a slow model that keeps every number, while a network loses and reorders datagrams and
-//! strangers invent gateways.
+//! Compares the table of gateways with a slow model that keeps every number, while a network loses and reorders
+//! datagrams and strangers invent gateways.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,5 +1,5 @@
-//! Golden datagrams of version 2, in `tests/vectors/datagram.json`, as a receiver without a key accepts or refuses them.
-//! `schema/tests/datagram.rs` tests their bytes.
+//! Golden datagrams of version 2, in `tests/vectors/datagram.json`, as a receiver without a key accepts or refuses
+//! them. `schema/tests/datagram.rs` tests their bytes.
 
 #[path = "../../../tests/it/lan/vectors.rs"]
 mod vectors;

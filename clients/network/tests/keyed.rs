@@ -1,5 +1,6 @@
-//! Golden datagrams with a MAC, in `tests/vectors/keyed.json`. The tests build them from values, and check that the receiver
-//! handles them as the list says, like the readers in other languages. Do not change the bytes: other programs have them.
+//! Golden datagrams with a MAC, in `tests/vectors/keyed.json`. The tests build them from values, and check that the
+//! receiver handles them as the list says, like the readers in other languages. Do not change the bytes: other programs
+//! have them.
 
 #[path = "../../../tests/it/lan/keyed_vectors.rs"]
 mod keyed_vectors;

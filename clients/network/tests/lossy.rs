@@ -1,5 +1,6 @@
-//! Both ends of a network that loses, duplicates, damages, delays and reorders datagrams, in virtual time. Sensors fall silent,
-//! and hub and gateway restart. Every received sample was sent, every lost one is counted, and no verdict is valid too long.
+//! Both ends of a network that loses, duplicates, damages, delays and reorders datagrams, in virtual time. Sensors fall
+//! silent, and hub and gateway restart. Every received sample was sent, every lost one is counted, and no verdict is
+//! valid too long.
 
 #[path = "../../../tests/world/src/network.rs"]
 mod network;
@@ -57,8 +58,9 @@ impl Run {
         Run { seed, faults, mishaps, every, longest, stalls }
     }
 
-    /// Returns how long a verdict is valid at most, as `docs/topics.md` promises: two periods of sending and 40 ms, at least 0.5 s
-    /// and at most 5.04 s. The period is estimated from arrivals, so delays of the network and pauses of the sensors extend it.
+    /// Returns how long a verdict is valid at most, as `docs/topics.md` promises: two periods of sending and 40 ms, at
+    /// least 0.5 s and at most 5.04 s. The period is estimated from arrivals, so delays of the network and pauses of
+    /// the sensors extend it.
     fn promised_ns(&self) -> Nanos {
         match self.mishaps {
             Mishaps { silence: false, hub: false, .. } => {
@@ -238,8 +240,8 @@ fn play(run: &Run) -> Observations {
     judged
 }
 
-/// Checks the counters of each epoch, sensor and topic: received numbers, lost numbers, and those that were sent before the first or
-/// after the last known one are all numbers.
+/// Checks the counters of each epoch, sensor and topic: received numbers, lost numbers, and those that were sent before
+/// the first or after the last known one are all numbers.
 fn check_counters(judged: &Observations, sent: &Sent, receiving: &Receiving) {
     let stats = receiving.incoming.gateways();
     let last = sent.datagrams.keys().map(|(epoch, ..)| *epoch).max();

@@ -18,14 +18,14 @@ struct Entry {
 }
 
 impl Selection {
-    /// Parses `texts`, each a pattern `SENSOR/TOPIC`, which `:every=N` may follow to thin the samples. If there are none, selects
-    /// the telegrams of all sensors if `bare`, and otherwise the topics of all sensors that [`is_default`](Self::is_default)
-    /// accepts.
+    /// Parses `texts`, each a pattern `SENSOR/TOPIC`, which `:every=N` may follow to thin the samples. If there are
+    /// none, selects the telegrams of all sensors if `bare`, and otherwise the topics of all sensors that
+    /// [`is_default`](Self::is_default) accepts.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Usage`] if a pattern or a number is not valid, a pattern is given twice, or a pattern does not name
-    /// telegrams although `bare` is set.
+    /// Returns [`Kind::Usage`] if a pattern or a number is not valid, a pattern is given twice, or a pattern does not
+    /// name telegrams although `bare` is set.
     pub fn parse(texts: &[String], bare: bool) -> Result<Selection, Failure> {
         let mut entries: Vec<Entry> = Vec::new();
         for text in texts {
@@ -53,8 +53,8 @@ impl Selection {
         Ok(Selection { entries })
     }
 
-    /// Returns whether `topic` is sent unless topics are named. Telegrams and clouds are many bytes; lines, motion and early
-    /// warnings cost CPU time only while they have a subscriber.
+    /// Returns whether `topic` is sent unless topics are named. Telegrams and clouds are many bytes; lines, motion and
+    /// early warnings cost CPU time only while they have a subscriber.
     pub fn is_default(topic: Topic) -> bool {
         !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud)
     }

@@ -1,5 +1,5 @@
-//! A host that gets copies, and the address that its name has now. The name is resolved again in the background, because that
-//! may take half a minute.
+//! A host that gets copies, and the address that its name has now. The name is resolved again in the background,
+//! because that may take half a minute.
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs};
@@ -34,8 +34,8 @@ impl Host {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if `text` does not name a host, or names a group, and [`Kind::Interrupted`] if `stop` is
-    /// set before it is resolved.
+    /// Returns [`Kind::Configuration`] if `text` does not name a host, or names a group, and [`Kind::Interrupted`] if
+    /// `stop` is set before it is resolved.
     pub(super) fn parse(text: &str, more_ports: u16, stop: &AtomicBool) -> Result<Host, Failure> {
         Host::resolve_with(resolve, text, more_ports, stop, Instant::now())
     }
@@ -92,8 +92,8 @@ impl Host {
         self.address = address;
     }
 
-    /// Returns the address that the name has now, if it has changed. Starts to resolve the name again once a minute, and more
-    /// often if it `is_failing`.
+    /// Returns the address that the name has now, if it has changed. Starts to resolve the name again once a minute,
+    /// and more often if it `is_failing`.
     pub(super) fn new_address(&mut self, is_failing: bool, now: Instant) -> Option<SocketAddr> {
         if let Some(task) = &self.task {
             let found = task.result()?;
@@ -111,7 +111,8 @@ impl Host {
     }
 }
 
-/// Resolves `HOST:PORT` with the system's resolver. It accepts an address with the name of an interface, but not in brackets.
+/// Resolves `HOST:PORT` with the system's resolver. It accepts an address with the name of an interface, but not in
+/// brackets.
 fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
     let bracketed = text.strip_prefix('[').and_then(|text| text.rsplit_once("]:"));
     let scoped = bracketed.filter(|(host, _)| host.contains('%'));
@@ -119,8 +120,8 @@ fn resolve(text: &str) -> io::Result<Vec<SocketAddr>> {
     Ok(plain.as_deref().unwrap_or(text).to_socket_addrs()?.collect())
 }
 
-/// Returns the address to send to: the current one if it is in `found`, otherwise the first IPv4 address, which all listeners
-/// receive, otherwise the first address.
+/// Returns the address to send to: the current one if it is in `found`, otherwise the first IPv4 address, which all
+/// listeners receive, otherwise the first address.
 fn choose(found: &[SocketAddr], current: Option<SocketAddr>) -> Option<SocketAddr> {
     let hosts: Vec<_> =
         found.iter().copied().map(canonical).filter(|address| is_host(address.ip())).collect();

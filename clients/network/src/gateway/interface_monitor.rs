@@ -1,5 +1,5 @@
-//! Monitors the network interface that multicast datagrams are sent on. The kernel accepts datagrams for an interface without a
-//! carrier and drops them without an error.
+//! Monitors the network interface that multicast datagrams are sent on. The kernel accepts datagrams for an interface
+//! without a carrier and drops them without an error.
 
 use std::fmt::Display;
 use std::io::{PipeReader, PipeWriter, pipe};
@@ -40,8 +40,8 @@ impl InterfaceMonitor {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist, and [`Kind::Failed`] if it cannot be
-    /// monitored.
+    /// Returns [`Kind::Configuration`], with a list of all interfaces, if it does not exist, and [`Kind::Failed`] if it
+    /// cannot be monitored.
     pub(super) fn open(name: &str) -> Result<InterfaceMonitor, Failure> {
         let unwatched = |why: &dyn Display| {
             Failure::new(Kind::Failed, format!("cannot watch network interfaces: {why}"), "")
@@ -65,7 +65,8 @@ impl InterfaceMonitor {
         &self.name
     }
 
-    /// Returns the kernel's index. It changes when the interface is created again. `None` while the interface does not exist.
+    /// Returns the kernel's index. It changes when the interface is created again. `None` while the interface does not
+    /// exist.
     pub(super) fn index(&self) -> Option<u32> {
         self.state.index
     }
@@ -101,8 +102,8 @@ impl State {
     }
 }
 
-/// Stores each new state of the interface called `name` in `latest`, until `end` is closed. If the kernel cannot list interfaces,
-/// the state remains, and the query is repeated.
+/// Stores each new state of the interface called `name` in `latest`, until `end` is closed. If the kernel cannot list
+/// interfaces, the state remains, and the query is repeated.
 fn monitor(name: &str, mut changes: InterfaceChanges, end: &PipeReader, latest: &AtomicU64) {
     let mut timeout = None;
     loop {
@@ -129,9 +130,9 @@ fn monitor(name: &str, mut changes: InterfaceChanges, end: &PipeReader, latest: 
     }
 }
 
-/// Returns the error for a gateway without an interface and without hosts, with a list of all interfaces. The user must name
-/// an interface, because everyone on its network can read what is sent to groups. If the system cannot list interfaces,
-/// returns that error.
+/// Returns the error for a gateway without an interface and without hosts, with a list of all interfaces. The user must
+/// name an interface, because everyone on its network can read what is sent to groups. If the system cannot list
+/// interfaces, returns that error.
 pub(super) fn no_destination() -> Failure {
     match interfaces() {
         Ok(all) => must_choose(&all),

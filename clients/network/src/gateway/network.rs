@@ -1,4 +1,5 @@
-//! Destinations of a gateway: the groups on an interface, and hosts that get copies. Each datagram is sent to all of them.
+//! Destinations of a gateway: the groups on an interface, and hosts that get copies. Each datagram is sent to all of
+//! them.
 
 use std::num::NonZeroU64;
 use std::sync::atomic::AtomicBool;
@@ -35,13 +36,14 @@ pub(super) struct Groups {
 }
 
 impl Network {
-    /// Opens a socket for each destination: the groups on `interface`, if it is named, with this `ttl`, and the hosts in `to`.
-    /// Datagrams have at most `longest` bytes, or less if the interface carries less.
+    /// Opens a socket for each destination: the groups on `interface`, if it is named, with this `ttl`, and the hosts
+    /// in `to`. Datagrams have at most `longest` bytes, or less if the interface carries less.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Configuration`] if `longest` is not possible, or a host is not valid or named twice,
-    /// [`Kind::Failed`] if a socket cannot be opened, and [`Kind::Interrupted`] if `stop` is set before all hosts are resolved.
+    /// [`Kind::Failed`] if a socket cannot be opened, and [`Kind::Interrupted`] if `stop` is set before all hosts are
+    /// resolved.
     pub(super) fn open(
         life: Life,
         interface: Option<InterfaceMonitor>,
@@ -122,8 +124,8 @@ impl Destinations {
 }
 
 impl Transmit for Destinations {
-    /// Sends a datagram to all destinations. It counts as sent if it was sent to the groups, or without groups to at least one
-    /// host.
+    /// Sends a datagram to all destinations. It counts as sent if it was sent to the groups, or without groups to at
+    /// least one host.
     fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
         let to_groups = self.groups.as_mut().map(|groups| groups.destination.send(datagram, group, above));
         let mut to_copies = false;

@@ -1,5 +1,6 @@
-//! One destination of datagrams: the groups on an interface, or a host. Each has its own socket, so that a failing destination
-//! does not affect others. Counts the datagrams that the kernel accepted and refused, and never reads what others send here.
+//! One destination of datagrams: the groups on an interface, or a host. Each has its own socket, so that a failing
+//! destination does not affect others. Counts the datagrams that the kernel accepted and refused, and never reads what
+//! others send here.
 
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -27,12 +28,13 @@ pub(super) struct UdpDestination {
     pub(super) name: String,
     /// Datagrams that the kernel accepted.
     pub(super) sent: u64,
-    /// Datagrams that were not sent: the queue was full, there was no route, the host refused an earlier datagram, or the
-    /// interface was down.
+    /// Datagrams that were not sent: the queue was full, there was no route, the host refused an earlier datagram, or
+    /// the interface was down.
     pub(super) failed: u64,
     /// Errors that the network reported for earlier datagrams.
     pub(super) reported: u64,
-    /// Whether the interface is down. The kernel still accepts datagrams then, and listeners on this machine receive them.
+    /// Whether the interface is down. The kernel still accepts datagrams then, and listeners on this machine receive
+    /// them.
     pub(super) is_down: bool,
     socket: UdpSocket,
     to: To,
@@ -92,7 +94,8 @@ impl UdpDestination {
         }
     }
 
-    /// Continues with the address that the host's name has now, and returns it if it has changed. Call it once a second.
+    /// Continues with the address that the host's name has now, and returns it if it has changed. Call it once a
+    /// second.
     pub(super) fn follow_name(&mut self, now: Instant) -> Option<SocketAddr> {
         let To::Host(host) = &mut self.to else { return None };
         let address = host.new_address(self.checks_without_failure.is_some(), now)?;
@@ -111,7 +114,8 @@ impl UdpDestination {
         let _ = set_ip_multicast_if_with_ifindex(&self.socket, &any, &any, index);
     }
 
-    /// Returns the length of the longest datagram that the interface with this index sends without fragments, if it is known.
+    /// Returns the length of the longest datagram that the interface with this index sends without fragments, if it is
+    /// known.
     pub(super) fn max_len(&self, index: u32) -> Option<usize> {
         const IP_AND_UDP: usize = 20 + 8;
         let any = Ipv4Addr::UNSPECIFIED;
@@ -121,8 +125,8 @@ impl UdpDestination {
         (ip_mtu(&probe).ok()? as usize).checked_sub(IP_AND_UDP)
     }
 
-    /// Sends a datagram, to the group with this last byte if the destination is the groups, and to the port that is `above` ports
-    /// after the usual one. Returns whether the kernel accepted it.
+    /// Sends a datagram, to the group with this last byte if the destination is the groups, and to the port that is
+    /// `above` ports after the usual one. Returns whether the kernel accepted it.
     pub(super) fn send(&mut self, datagram: &[u8], group: u8, above: u8) -> bool {
         let mut address = match &self.to {
             To::Groups { port } => SocketAddr::from(([GROUPS[0], GROUPS[1], GROUPS[2], group], *port)),
@@ -214,8 +218,8 @@ fn socket(ip: IpAddr) -> io::Result<UdpSocket> {
     let socket = UdpSocket::bind((any, 0))?;
     // A full queue is an error, instead of a wait.
     socket.set_nonblocking(true)?;
-    // Without the first option, the kernel reports datagrams as sent that its queues have dropped. The second one makes it refuse
-    // datagrams that are too long for the path, instead of fragmenting them.
+    // Without the first option, the kernel reports datagrams as sent that its queues have dropped. The second one makes
+    // it refuse datagrams that are too long for the path, instead of fragmenting them.
     if ip.is_ipv4() {
         setsockopt(socket.as_raw_fd(), Ipv4RecvErr, &true)?;
         set_ip_mtu_discover(&socket, Ipv4PathMtuDiscovery::DO)?;
@@ -240,8 +244,8 @@ fn no_socket(error: &io::Error) -> Failure {
 }
 
 const NOBODY: &str = "nobody is there";
-/// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host without
-/// a receiver at most once a second.
+/// Number of checks without a failure after which a destination has recovered. The network reports the errors of a host
+/// without a receiver at most once a second.
 const RECOVERY_CHECKS: u32 = 2;
 
 #[cfg(test)]

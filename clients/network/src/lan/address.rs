@@ -1,5 +1,5 @@
-//! Names of samples in networks that deliver by name: hub, sensor and topic as a path. A sender may use any name, so each name is
-//! compared with the datagram.
+//! Names of samples in networks that deliver by name: hub, sensor and topic as a path. A sender may use any name, so
+//! each name is compared with the datagram.
 
 use std::fmt;
 
@@ -34,8 +34,8 @@ impl<'a> Address<'a> {
         Some(Address { hub, sensor, topic })
     }
 
-    /// Returns whether `datagram` may be sent under this name: hub and topic are the same, and its sensor was announced under
-    /// this name, or not at all yet.
+    /// Returns whether `datagram` may be sent under this name: hub and topic are the same, and its sensor was announced
+    /// under this name, or not at all yet.
     pub fn is_of(&self, datagram: &Datagram<'_>, gateways: &GatewayTable) -> bool {
         let head = &datagram.head;
         let number = self.topic.map_or(Announce::NUMBER, Topic::number);

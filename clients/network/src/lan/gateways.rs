@@ -2,8 +2,8 @@
 //!
 //! Each start of a gateway is a run with its own epoch. The run with the highest epoch is active, and lower ones are
 //! retired. Memory is bounded by the number of runs and of their sensors and topics, no matter who sends. There is one
-//! rule for the run that makes room for another one: the run that retired first is evicted. If no run is retired, active
-//! runs are compared by their [`Standing`].
+//! rule for the run that makes room for another one: the run that retired first is evicted. If no run is retired,
+//! active runs are compared by their [`Standing`].
 //!
 //! Anyone who can send can invent gateways. A run that is known to deliver is therefore never evicted for one that only
 //! announces itself, and the run that has been silent for longest goes first. Time is an argument, and MACs are checked
@@ -28,15 +28,16 @@ pub(crate) const MAX_EPOCHS: usize = 1024;
 /// Gateways that a receiver distinguishes: their runs, sensors, senders, clocks and counters.
 ///
 /// The counters of a topic start with its first datagram, or with an announcement that arrives before it. Samples that
-/// were sent earlier are not counted. An announcement that arrives after the first datagram therefore says nothing about
-/// earlier ones, and a late datagram from before the start moves the start back.
+/// were sent earlier are not counted. An announcement that arrives after the first datagram therefore says nothing
+/// about earlier ones, and a late datagram from before the start moves the start back.
 ///
 /// The counters of an evicted run, and of a gateway that is forgotten with its last run, are added to
-/// [`evicted`](GatewayTable::evicted). Rows and evicted totals together therefore always count everything that was accepted.
+/// [`evicted`](GatewayTable::evicted). Rows and evicted totals together therefore always count everything that was
+/// accepted.
 ///
 /// Two gateways with the same number and epoch are distinguished by their senders and announcements, and only the first
-/// one is accepted. After 3 s of its silence, another sender is accepted as a new run, but not if two gateways are known
-/// to send.
+/// one is accepted. After 3 s of its silence, another sender is accepted as a new run, but not if two gateways are
+/// known to send.
 pub struct GatewayTable {
     /// Bit n is set if the receiver has joined the group of topic number n.
     followed: u64,
@@ -139,8 +140,8 @@ pub(super) struct Accepted {
 }
 
 impl GatewayTable {
-    /// Creates a table for a receiver that has joined the groups of `topics`. Announcements of other topics are ignored,
-    /// because their samples would count as lost.
+    /// Creates a table for a receiver that has joined the groups of `topics`. Announcements of other topics are
+    /// ignored, because their samples would count as lost.
     pub fn new(topics: &[Topic]) -> GatewayTable {
         GatewayTable {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
@@ -158,8 +159,8 @@ impl GatewayTable {
     }
 
     /// Returns the table of a receiver with a key. It accepts samples only from announced sensors and topics, starting
-    /// with the number in the first announcement, and no run before those in `epochs`. It does not accept another sender
-    /// as the next run of a silent gateway. Recorded datagrams therefore cannot be replayed.
+    /// with the number in the first announcement, and no run before those in `epochs`. It does not accept another
+    /// sender as the next run of a silent gateway. Recorded datagrams therefore cannot be replayed.
     pub(super) fn keyed(mut self, epochs: HashMap<u64, u32>) -> GatewayTable {
         self.is_keyed = true;
         let mut epochs: Vec<_> = epochs.into_iter().collect();
@@ -348,8 +349,8 @@ impl GatewayTable {
     }
 
     /// Records an announcement that was accepted and is newer than all others of its sensor. Returns by how much this
-    /// machine's clock is ahead of the gateway's, in ns, if they differ and it was not reported yet, and whether the sensor
-    /// was printed under its number before.
+    /// machine's clock is ahead of the gateway's, in ns, if they differ and it was not reported yet, and whether the
+    /// sensor was printed under its number before.
     pub(super) fn announce(&mut self, head: &Head, announce: &Announce, wall_ns: u64) -> (Option<i64>, bool) {
         let Some(gateway) = self.gateways.get_mut(&head.hub) else { return (None, false) };
         let Some(run) = gateway.runs.get_mut(&head.epoch) else { return (None, false) };
@@ -368,8 +369,8 @@ impl GatewayTable {
         (ahead_ns.filter(|_| is_new), is_named)
     }
 
-    /// Returns the age of a sample that arrived at `wall_ns`, in ns. `None` while the difference of the clocks is unknown,
-    /// and if they differ too much.
+    /// Returns the age of a sample that arrived at `wall_ns`, in ns. `None` while the difference of the clocks is
+    /// unknown, and if they differ too much.
     pub(super) fn age_ns(&self, head: &Head, wall_ns: u64) -> Option<u64> {
         self.run((head.hub, head.epoch)).filter(|run| run.delays.clocks_agree())?;
         wall_ns.checked_sub(head.stamp_ns)
@@ -404,8 +405,8 @@ impl GatewayTable {
         }
     }
 
-    /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as last announced.
-    /// `None` if that was not announced.
+    /// Returns how many samples of the row's topic were replaced by newer ones before they were sent, as last
+    /// announced. `None` if that was not announced.
     pub fn replaced(&self, row: &Row) -> Option<u32> {
         self.announced(row.hub, row.epoch, row.sensor)?.replaced(row.topic)
     }
@@ -417,8 +418,8 @@ impl GatewayTable {
         }
     }
 
-    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and the number of
-    /// these samples. Those of forgotten gateways are in [`EvictedTotals::no_room`].
+    /// Returns the gateways with samples that did not fit into the memory that remote sensors may use, and the number
+    /// of these samples. Those of forgotten gateways are in [`EvictedTotals::no_room`].
     pub fn no_room(&self) -> impl Iterator<Item = (u64, u64)> {
         let all = self.gateways.iter().map(|(hub, gateway)| (*hub, gateway.no_room));
         all.filter(|(_, no_room)| *no_room > 0)
@@ -480,8 +481,8 @@ impl GatewayTable {
         self.run((hub, epoch))?.sensors.get(&sensor)
     }
 
-    /// Returns the row of the sensor that sent `head` for `topic`, or a new row that starts with `first`. `None` if there is
-    /// no room.
+    /// Returns the row of the sensor that sent `head` for `topic`, or a new row that starts with `first`. `None` if
+    /// there is no room.
     fn row(&mut self, head: &Head, topic: u8, first: u32, arrival: Arrival) -> Option<&mut Row> {
         let Head { hub, epoch, sensor, .. } = *head;
         let known = self.sensor(hub, epoch, sensor);
@@ -520,8 +521,8 @@ impl GatewayTable {
         if self.run_count > MAX_RUNS { self.evict(run_id, arrival) } else { None }
     }
 
-    /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns it. Returns `None` if all other runs
-    /// are active and known to deliver, or if they have just delivered and `arrival` is not a sample.
+    /// Evicts a run to make room for `run_id`, to which `arrival` belongs, and returns it. Returns `None` if all other
+    /// runs are active and known to deliver, or if they have just delivered and `arrival` is not a sample.
     fn evict(&mut self, run_id: RunId, arrival: Arrival) -> Option<RunId> {
         let (evicted, is_displaced) = self.next_evicted(run_id, arrival)?;
         self.end(evicted, is_displaced);
@@ -646,8 +647,8 @@ impl Standing {
         !is_busy || arrival.delivers && !self.is_proven()
     }
 
-    /// Returns the time until which the run counts as active. Among the runs that may be evicted, the one with the lowest
-    /// value is evicted first.
+    /// Returns the time until which the run counts as active. Among the runs that may be evicted, the one with the
+    /// lowest value is evicted first.
     pub(super) fn worth_ns(&self) -> u64 {
         match self.delivered_ns {
             None => self.heard_ns,
@@ -661,8 +662,8 @@ impl Standing {
     }
 }
 
-/// Delays of the last announcements of a run. An announcement is stamped when it is sent, so its delay is the transit time
-/// plus the difference of the clocks. The shortest one is the least disturbed.
+/// Delays of the last announcements of a run. An announcement is stamped when it is sent, so its delay is the transit
+/// time plus the difference of the clocks. The shortest one is the least disturbed.
 #[derive(Default)]
 struct Delays {
     last_ns: [i64; DELAYS],
@@ -671,8 +672,8 @@ struct Delays {
 
 /// Number of announcements that count: those of two sensors in the last five seconds.
 const DELAYS: usize = 10;
-/// Maximum difference of clocks that are treated as one. An age is at least the time of a telegram on its line, which is
-/// 15 ms or more.
+/// Maximum difference of clocks that are treated as one. An age is at least the time of a telegram on its line, which
+/// is 15 ms or more.
 const CLOCKS_AGREE_NS: u64 = 20_000_000;
 
 impl Delays {
@@ -681,8 +682,8 @@ impl Delays {
         self.count += 1;
     }
 
-    /// Returns by how much this machine's clock is ahead of the gateway's, plus the shortest transit time, in ns. `None`
-    /// before the first announcement.
+    /// Returns by how much this machine's clock is ahead of the gateway's, plus the shortest transit time, in ns.
+    /// `None` before the first announcement.
     fn difference_ns(&self) -> Option<i64> {
         self.last_ns[..self.count.min(DELAYS)].iter().min().copied()
     }

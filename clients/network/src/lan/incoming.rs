@@ -1,9 +1,9 @@
 //! The receiving end of a network: each datagram is refused, recorded in the table of gateways, or becomes a new sample
 //! with everything that is known about its sender.
 //!
-//! With a key, only datagrams that are authenticated with it are accepted. A recording of such datagrams is refused when it is
-//! sent again: a sensor is accepted once an announcement arrives that was sent just now, by this machine's clock. From then
-//! on, sequence numbers only increase.
+//! With a key, only datagrams that are authenticated with it are accepted. A recording of such datagrams is refused
+//! when it is sent again: a sensor is accepted once an announcement arrives that was sent just now, by this machine's
+//! clock. From then on, sequence numbers only increase.
 
 use std::collections::HashMap;
 
@@ -120,8 +120,8 @@ pub struct Remote<'a> {
 }
 
 impl Remote<'_> {
-    /// Returns the header of the sample when process `pid` publishes it here. Its stamps are those of the arrival, and the
-    /// sensor's is in `wall_ns`. It has no period, because a gateway may leave out samples.
+    /// Returns the header of the sample when process `pid` publishes it here. Its stamps are those of the arrival, and
+    /// the sensor's is in `wall_ns`. It has no period, because a gateway may leave out samples.
     pub fn header(&self, pid: u32) -> Header {
         let head = &self.head;
         let quality = if head.flags & LanFlags::SUSPECT != 0 { Quality::Suspect } else { Quality::Clean };
@@ -167,14 +167,15 @@ impl Arrived<'_> {
 }
 
 impl Incoming {
-    /// Creates a receiving end without a key. Announcements are accepted for `topics`, as [`GatewayTable::new`] explains.
+    /// Creates a receiving end without a key. Announcements are accepted for `topics`, as [`GatewayTable::new`]
+    /// explains.
     pub fn new(topics: &[Topic]) -> Incoming {
         let (gateways, parts) = (GatewayTable::new(topics), Reassembler::default());
         Incoming { gateways, parts, key: None, hubs: Vec::new() }
     }
 
-    /// Creates a receiving end that accepts only what is authenticated with `key`. `epochs` has the highest epoch of each
-    /// gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
+    /// Creates a receiving end that accepts only what is authenticated with `key`. `epochs` has the highest epoch of
+    /// each gateway that was received before, see [`take_epochs`](Incoming::take_epochs).
     pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
         let end = Incoming::new(topics);
         Incoming { gateways: end.gateways.keyed(epochs), key: Some(key), ..end }
@@ -185,8 +186,8 @@ impl Incoming {
         Incoming { hubs, ..self }
     }
 
-    /// Returns the highest authenticated epochs of all gateways, which must outlive this process, if one is new since the last
-    /// call.
+    /// Returns the highest authenticated epochs of all gateways, which must outlive this process, if one is new since
+    /// the last call.
     pub fn take_epochs(&mut self) -> Option<HashMap<u64, u32>> {
         self.gateways.take_epochs()
     }
@@ -206,8 +207,8 @@ impl Incoming {
         self.gateways.printed_name(head)
     }
 
-    /// Handles `bytes`, a whole datagram that arrived at `arrival`. `from` identifies the sender, for example by its address and
-    /// port. A sample that was sent in parts is written to `whole` once it is complete.
+    /// Handles `bytes`, a whole datagram that arrived at `arrival`. `from` identifies the sender, for example by its
+    /// address and port. A sample that was sent in parts is written to `whole` once it is complete.
     pub fn receive<'a>(
         &mut self,
         bytes: &'a [u8],
@@ -269,7 +270,8 @@ impl Incoming {
         }
     }
 
-    /// Checks that `datagram`, which was read from `bytes`, is authenticated and cannot be a recorded one, if there is a key.
+    /// Checks that `datagram`, which was read from `bytes`, is authenticated and cannot be a recorded one, if there is
+    /// a key.
     fn check_key(&self, bytes: &[u8], datagram: &Datagram<'_>, arrival: Stamp) -> Result<(), DatagramError> {
         let (Some(key), head) = (&self.key, &datagram.head) else { return Ok(()) };
         if !key.is_of(bytes, datagram.mac.ok_or(DatagramError::Unauthenticated)?) {
@@ -284,7 +286,8 @@ impl Incoming {
         Ok(())
     }
 
-    /// Returns the complete sample of `datagram`: itself, or the sample that it is the last part of, which is written to `whole`.
+    /// Returns the complete sample of `datagram`: itself, or the sample that it is the last part of, which is written
+    /// to `whole`.
     fn complete<'a>(
         &mut self,
         datagram: Datagram<'a>,

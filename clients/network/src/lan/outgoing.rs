@@ -53,8 +53,8 @@ macro_rules! payloads {
                 match self { $(PayloadRef::$topic(_) => Topic::$topic,)* }
             }
 
-            /// Writes the payload in its form for networks to the start of `room`, and returns its length. `None` if there
-            /// is too little room.
+            /// Writes the payload in its form for networks to the start of `room`, and returns its length. `None` if
+            /// there is too little room.
             pub fn pack(self, room: &mut [u8]) -> Option<usize> {
                 match self { $(PayloadRef::$topic(payload) => payload.pack(room),)* }
             }
@@ -65,20 +65,21 @@ macro_rules! payloads {
 scanhub_schema::for_each_topic!(payloads);
 
 impl Outgoing {
-    /// Creates the end of gateway `hub` in its run `epoch`. Its datagrams have at most `longest` bytes, and never more than
-    /// [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
+    /// Creates the end of gateway `hub` in its run `epoch`. Its datagrams have at most `longest` bytes, and never more
+    /// than [`MTU_ETHERNET`](scanhub_schema::datagram::MTU_ETHERNET).
     pub fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Outgoing {
         Outgoing { writer: DatagramWriter::new(hub, epoch, form, longest), sensors: Vec::new() }
     }
 
-    /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of each
-    /// sensor and topic waits until [`hand`](Outgoing::hand) takes it. A sample is one datagram, however long it is.
+    /// Creates the end of gateway `hub` in its run `epoch` for a connection that is slow at times: the newest sample of
+    /// each sensor and topic waits until [`hand`](Outgoing::hand) takes it. A sample is one datagram, however long it
+    /// is.
     pub fn waiting(hub: u64, epoch: u32) -> Outgoing {
         Outgoing { writer: DatagramWriter::waiting(hub, epoch), sensors: Vec::new() }
     }
 
-    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent. Returns the
-    /// sensor's position, which identifies it from now on.
+    /// Adds the sensor called `name`. `every` is the thinning factor of each topic, or `None` if it is not sent.
+    /// Returns the sensor's position, which identifies it from now on.
     pub fn follow(&mut self, name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> usize {
         self.sensors.push(Sensor::new(name, every));
         self.sensors.len() - 1
@@ -89,15 +90,16 @@ impl Outgoing {
         self.sensors.iter().position(|sensor| sensor.name == name)
     }
 
-    /// Returns whether samples of this topic are needed, because they are sent or an announcement contains something of them.
+    /// Returns whether samples of this topic are needed, because they are sent or an announcement contains something of
+    /// them.
     pub fn wants(&self, sensor: usize, topic: Topic) -> bool {
         let is_announced = self.writer.announces();
         self.sensors[sensor].sends(topic) || is_announced && topic == Topic::Status
     }
 
-    /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of a run of
-    /// the hub, it sends an announcement. It sends nothing if the sample is thinned out, is a background that was sent before,
-    /// or comes from another machine.
+    /// Sends a sample of the sensor at this position, or a silence of its zones, to `to`. Before the first sample of a
+    /// run of the hub, it sends an announcement. It sends nothing if the sample is thinned out, is a background that
+    /// was sent before, or comes from another machine.
     pub fn sample(&mut self, sensor: usize, sample: &Sample<'_>, now: Stamp, to: &mut impl Transmit) {
         self.sensors[sensor].send(sample, now, &mut self.writer, to);
     }
@@ -112,7 +114,8 @@ impl Outgoing {
         self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.writer, to));
     }
 
-    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none waits.
+    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
+    /// waits.
     pub fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
         self.writer.take_next(now)
     }
@@ -122,15 +125,15 @@ impl Outgoing {
         self.writer.is_waiting()
     }
 
-    /// Counts the last sample that [`hand`](Outgoing::hand) returned for this sensor and topic, of `bytes` bytes, as failed. Its
-    /// number stays in use.
+    /// Counts the last sample that [`hand`](Outgoing::hand) returned for this sensor and topic, of `bytes` bytes, as
+    /// failed. Its number stays in use.
     pub fn not_taken(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
         self.writer.mark_failed(sensor, topic, bytes);
     }
 
     /// Returns the announcement (no topic), the status or the background of the sensor called `name` that
-    /// [`hand`](Outgoing::hand) returned last, for a receiver that queries it at `now`. It has the number that it had before,
-    /// so that receivers count it once.
+    /// [`hand`](Outgoing::hand) returned last, for a receiver that queries it at `now`. It has the number that it had
+    /// before, so that receivers count it once.
     pub fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
         self.writer.resend_last(name, topic, now)
     }
@@ -146,8 +149,8 @@ impl Outgoing {
         self.writer.forget_kept();
     }
 
-    /// Returns whether samples wait, so that newer ones may replace them. Announcements then contain the number of replaced
-    /// samples.
+    /// Returns whether samples wait, so that newer ones may replace them. Announcements then contain the number of
+    /// replaced samples.
     pub(crate) fn tells_replaced(&self) -> bool {
         self.writer.counts_replaced()
     }

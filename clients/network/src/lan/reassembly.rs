@@ -1,9 +1,10 @@
-//! Reassembles samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is bounded, no
-//! matter who sends what.
+//! Reassembles samples that are sent in parts. Parts may arrive in any order, twice, or not at all. Memory is bounded,
+//! no matter who sends what.
 
 use scanhub_schema::datagram::{Datagram, Head, PART_LONGEST};
 
-/// Samples that are not complete yet. A sample that is evicted for another one is not reported: its number did not arrive.
+/// Samples that are not complete yet. A sample that is evicted for another one is not reported: its number did not
+/// arrive.
 #[derive(Default)]
 pub(super) struct Reassembler {
     partial: Vec<PartialSample>,
@@ -34,8 +35,8 @@ const MAX_OF_TOPIC: usize = 4;
 const MAX_OF_ALL: usize = 64;
 
 impl Reassembler {
-    /// Takes a part from the sender `from`. `is_known` says whether its sample is a duplicate. Once the sample is complete,
-    /// writes it to `whole`, and returns its header.
+    /// Takes a part from the sender `from`. `is_known` says whether its sample is a duplicate. Once the sample is
+    /// complete, writes it to `whole`, and returns its header.
     pub(super) fn take(
         &mut self,
         part: &Datagram<'_>,
@@ -68,8 +69,9 @@ impl Reassembler {
         Some(Head { parts: 1, ..head })
     }
 
-    /// Adds a sample, and returns its index. If there is no room, it replaces a sample with the same number and another header,
-    /// the one of its topic that has waited for longest, or the one of all. A duplicate never replaces a new sample.
+    /// Adds a sample, and returns its index. If there is no room, it replaces a sample with the same number and another
+    /// header, the one of its topic that has waited for longest, or the one of all. A duplicate never replaces a new
+    /// sample.
     fn begin(&mut self, head: Head, from: u64, is_known: bool) -> Option<usize> {
         let topic = |it: &PartialSample| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
         let of_topic = (from, head.hub, head.epoch, head.sensor, head.topic);

@@ -1,5 +1,5 @@
-//! Publishes the sensors of other machines in the domain of this one, so that programs can subscribe to them like to those
-//! of a hub. Samples come from [`Incoming`](super::incoming::Incoming), and where topics are created is up to a
+//! Publishes the sensors of other machines in the domain of this one, so that programs can subscribe to them like to
+//! those of a hub. Samples come from [`Incoming`](super::incoming::Incoming), and where topics are created is up to a
 //! [`TopicStore`].
 
 mod remote_sensor;
@@ -55,8 +55,8 @@ pub struct LeftOut {
 /// Maximum number of sensors. Anyone who can send to the network can announce some.
 pub(crate) const MAX_SENSORS: usize = 16;
 
-/// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes milliseconds, and
-/// anyone who can send can cause it.
+/// Interval at which one more sensor may be evicted, after as many as there is room for. An eviction takes
+/// milliseconds, and anyone who can send can cause it.
 const ALLOW_EVERY_NS: u64 = 250_000_000;
 
 /// Interval at which late joiners receive the last status, zones and background.
@@ -88,7 +88,8 @@ impl<S: TopicStore> Republisher<S> {
         Republisher { only_proven: true, ..self }
     }
 
-    /// Handles the start of a gateway's run with `head`. Published sensors with the same epoch belong to another gateway.
+    /// Handles the start of a gateway's run with `head`. Published sensors with the same epoch belong to another
+    /// gateway.
     pub fn begun(&mut self, head: &Head, now: Stamp) {
         self.sensors
             .iter_mut()
@@ -96,12 +97,13 @@ impl<S: TopicStore> Republisher<S> {
             .for_each(|sensor| sensor.replaced(now));
     }
 
-    /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of its sensor. Returns the
-    /// sensor's name here once all of them exist.
+    /// Handles an announcement of the gateway that is called `hub`: creates the missing topics of its sensor. Returns
+    /// the sensor's name here once all of them exist.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are not affected.
+    /// Returns [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. Other sensors are not
+    /// affected.
     pub fn announced(
         &mut self,
         announcement: &Announcement,
@@ -116,9 +118,9 @@ impl<S: TopicStore> Republisher<S> {
         made
     }
 
-    /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as [`announced`](Self::announced)
-    /// does if its gateway is known to deliver since this sample. If there is no room for its sensor, another one may be
-    /// evicted.
+    /// Publishes `sample`, or counts it in [`left_out`](Self::left_out). Creates its topics as
+    /// [`announced`](Self::announced) does if its gateway is known to deliver since this sample. If there is no room
+    /// for its sensor, another one may be evicted.
     ///
     /// # Errors
     ///
@@ -149,8 +151,8 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter_mut().for_each(RemoteSensor::wake);
     }
 
-    /// Does what is due at `now_ns`: reports silent sensors, connects late joiners, and cleans up after dead subscribers.
-    /// Everything that arrived before `read` has been handled, so a silence is reported as of that time.
+    /// Does what is due at `now_ns`: reports silent sensors, connects late joiners, and cleans up after dead
+    /// subscribers. Everything that arrived before `read` has been handled, so a silence is reported as of that time.
     pub fn look(&mut self, now_ns: u64, read: Stamp) {
         if now_ns >= self.greet_ns {
             self.greet_ns = now_ns + GREET_EVERY_NS;
@@ -176,9 +178,9 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.iter().map(|sensor| sensor.name.as_str()).collect()
     }
 
-    /// Creates the missing topics of the sensor in `announce`, from the gateway that is called `hub`. Returns the sensor's name
-    /// here once all of them exist. A sensor that had its number before loses it, even if there is no room for this one, so
-    /// that no sample is published under another sensor's name.
+    /// Creates the missing topics of the sensor in `announce`, from the gateway that is called `hub`. Returns the
+    /// sensor's name here once all of them exist. A sensor that had its number before loses it, even if there is no
+    /// room for this one, so that no sample is published under another sensor's name.
     ///
     /// If there is no room, a sample evicts another sensor that is not known to deliver. An announcement does not.
     fn make(
@@ -247,8 +249,8 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.len() == MAX_SENSORS || !self.store.fits(&topics(announce))
     }
 
-    /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a candidate. Samples
-    /// from another run of the hub than `boot` may belong to another sensor, so they are dropped.
+    /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a
+    /// candidate. Samples from another run of the hub than `boot` may belong to another sensor, so they are dropped.
     fn publish_kept(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
         let Some(candidate) = candidate else { return };
         let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) else {
@@ -375,8 +377,8 @@ pub trait SensorTopics {
     fn failed(&self) -> u64;
 }
 
-/// Sensors that were announced before their gateway was known to deliver, the last ones. They have no topics yet, but the last
-/// sample of each topic with a history is kept: a background, for example, is sent only once.
+/// Sensors that were announced before their gateway was known to deliver, the last ones. They have no topics yet, but
+/// the last sample of each topic with a history is kept: a background, for example, is sent only once.
 #[derive(Default)]
 pub(super) struct Candidates(VecDeque<Candidate>);
 

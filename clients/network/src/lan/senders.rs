@@ -1,9 +1,9 @@
 //! Detects two gateways that send under one number, for example because one machine was made from a copy of the other's
 //! disk. Their samples must not become one stream.
 //!
-//! Gateways with the same epoch are distinguished by their senders and by the run of the hub (`boot`) that they announce.
-//! A sender is any number that differs between two of them. If the epochs differ, the gateway with the lower one is
-//! refused for as long as both send. Time is an argument.
+//! Gateways with the same epoch are distinguished by their senders and by the run of the hub (`boot`) that they
+//! announce. A sender is any number that differs between two of them. If the epochs differ, the gateway with the lower
+//! one is refused for as long as both send. Time is an argument.
 
 /// Senders of one run of a gateway.
 #[derive(Clone, Copy)]
@@ -145,8 +145,8 @@ impl Sender {
     }
 }
 
-/// Detects that a gateway of a lower epoch goes on sending, unlike a gateway that was restarted, from whose previous run a
-/// few datagrams arrive late.
+/// Detects that a gateway of a lower epoch goes on sending, unlike a gateway that was restarted, from whose previous
+/// run a few datagrams arrive late.
 #[derive(Default)]
 pub(super) struct DuplicateDetector {
     /// Start of the window, which begins with a refused datagram.
@@ -170,8 +170,8 @@ impl DuplicateDetector {
         self.is_accepted = true;
     }
 
-    /// Records that a datagram was refused because of its epoch or sender. Returns whether two gateways are known to send
-    /// since this datagram.
+    /// Records that a datagram was refused because of its epoch or sender. Returns whether two gateways are known to
+    /// send since this datagram.
     pub(super) fn refused(&mut self, now_ns: u64) -> bool {
         let is_accepted = std::mem::take(&mut self.is_accepted);
         let Some(since_ns) = self.since_ns else {
@@ -275,8 +275,8 @@ mod tests {
         assert_eq!(send(&mut senders, 2, Some(7), 1000), SenderMatch::Own);
     }
 
-    /// Each datagram that is accepted is followed by one that is refused, every `every_ms`, `count` times. Returns which
-    /// of them report two gateways.
+    /// Each datagram that is accepted is followed by one that is refused, every `every_ms`, `count` times. Returns
+    /// which of them report two gateways.
     fn reports(detector: &mut DuplicateDetector, begin_ms: u64, every_ms: u64, count: u64) -> Vec<u64> {
         let turn = |n: &u64| {
             detector.accepted();

@@ -95,8 +95,8 @@ impl Row {
         !self.is_ahead(sequence) && self.has(self.number(sequence))
     }
 
-    /// Returns how many numbers between the one before `sequence` and `sequence` have not arrived. 0 for a number that is
-    /// late, or that was sent before the first announcement.
+    /// Returns how many numbers between the one before `sequence` and `sequence` have not arrived. 0 for a number that
+    /// is late, or that was sent before the first announcement.
     pub(super) fn missed_before(&self, sequence: u32) -> u32 {
         let before = if self.received > 0 { self.highest + 1 } else { self.lowest };
         u32::try_from(self.number(sequence) - before).unwrap_or_default()

@@ -1,5 +1,5 @@
-//! Socket that receives the datagrams of groups on every interface with a carrier, including interfaces that appear or come
-//! back later.
+//! Socket that receives the datagrams of groups on every interface with a carrier, including interfaces that appear or
+//! come back later.
 
 use std::io::{self, IoSliceMut};
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
@@ -61,20 +61,21 @@ struct Joined {
 /// Interval between updates of the interfaces without a report of the kernel. Each one retries what has failed before.
 const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Size of the kernel's buffer for datagrams that arrive while this process does not run, in bytes. The system may reduce it.
+/// Size of the kernel's buffer for datagrams that arrive while this process does not run, in bytes. The system may
+/// reduce it.
 const RECEIVE_BUFFER: usize = 4 << 20;
 
 /// Maximum length of a datagram, in bytes.
 pub(super) const MAX_DATAGRAM_LEN: usize = 65_536;
 
 impl MulticastReceiver {
-    /// Binds the port, and joins the `groups` (their last bytes) on the interface `only`, or on all interfaces with a carrier. An
-    /// interface without a carrier is joined once it has one.
+    /// Binds the port, and joins the `groups` (their last bytes) on the interface `only`, or on all interfaces with a
+    /// carrier. An interface without a carrier is joined once it has one.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] if the interface does not exist or has no multicast, and [`Kind::Failed`] if the port is
-    /// not available.
+    /// Returns [`Kind::Configuration`] if the interface does not exist or has no multicast, and [`Kind::Failed`] if the
+    /// port is not available.
     pub(super) fn open(
         only: Option<&str>,
         groups: &[u8],
@@ -110,9 +111,9 @@ impl MulticastReceiver {
         Ok(receiver)
     }
 
-    /// Joins the groups on interfaces that have a new carrier, if the kernel has reported a change or an update is due. This is
-    /// necessary even for a known interface: a switch that filters by group forgets its members when a cable is unplugged.
-    /// If the system cannot list interfaces, the groups remain as they are until the next update.
+    /// Joins the groups on interfaces that have a new carrier, if the kernel has reported a change or an update is due.
+    /// This is necessary even for a known interface: a switch that filters by group forgets its members when a cable is
+    /// unplugged. If the system cannot list interfaces, the groups remain as they are until the next update.
     pub(super) fn update_interfaces(&mut self, now: Instant) {
         if !self.is_changed && now < self.update_at {
             return;
@@ -236,16 +237,16 @@ impl MulticastReceiver {
     }
 }
 
-/// Leaves the groups that were joined on the interface with this index. This is necessary even if the interface no longer
-/// exists: a socket keeps its memberships there, and has 20 at most (`net.ipv4.igmp_max_memberships`).
+/// Leaves the groups that were joined on the interface with this index. This is necessary even if the interface no
+/// longer exists: a socket keeps its memberships there, and has 20 at most (`net.ipv4.igmp_max_memberships`).
 fn leave(socket: &UdpSocket, groups: &[Ipv4Addr], index: u32) {
     for group in groups {
         let _ = SockRef::from(socket).leave_multicast_v4_n(group, &InterfaceIndexOrAddress::Index(index));
     }
 }
 
-/// Returns how long a datagram has waited that arrived at `arrived_ns`. Both times come from the wall clock, which may have been
-/// set in between, so the result is limited to `at_most_ns`, the time since no datagram was waiting.
+/// Returns how long a datagram has waited that arrived at `arrived_ns`. Both times come from the wall clock, which may
+/// have been set in between, so the result is limited to `at_most_ns`, the time since no datagram was waiting.
 fn waited_ns(arrived_ns: Option<u64>, wall_ns: u64, at_most_ns: u64) -> u64 {
     arrived_ns.map_or(0, |arrived_ns| wall_ns.saturating_sub(arrived_ns)).min(at_most_ns)
 }
@@ -255,8 +256,8 @@ fn wall_ns(at: TimeSpec) -> u64 {
     u64::try_from(Duration::from(at).as_nanos()).unwrap_or_default()
 }
 
-/// Binds the port on all addresses, so that copies to this machine are received, too. Datagrams of groups that only other
-/// programs have joined are not received.
+/// Binds the port on all addresses, so that copies to this machine are received, too. Datagrams of groups that only
+/// other programs have joined are not received.
 fn bind() -> io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_reuse_address(true)?;

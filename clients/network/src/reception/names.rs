@@ -67,15 +67,16 @@ fn number(text: &str) -> Option<u64> {
     u64::from_str_radix(text, 16).ok().filter(|_| is_hex)
 }
 
-/// Form of a hub's name. Its sensors are called `HUB.SENSOR`, and both halves have the same form. `robot` means all sensors.
+/// Form of a hub's name. Its sensors are called `HUB.SENSOR`, and both halves have the same form. `robot` means all
+/// sensors.
 const HUB_NAMES: &str = "1 to 24 of a-z, 0-9, _ and -, but not robot";
 
 /// Returns the topics that `texts` name, each as `*/TOPIC`, or all if there are none.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Usage`] if there is no such topic, or if a sensor or a thinning factor is named: a receiver counts all
-/// samples of a topic, and learns the names of sensors only from announcements.
+/// Returns [`Kind::Usage`] if there is no such topic, or if a sensor or a thinning factor is named: a receiver counts
+/// all samples of a topic, and learns the names of sensors only from announcements.
 pub fn received_topics(texts: &[String]) -> Result<Vec<Topic>, Failure> {
     let mut wanted = Vec::new();
     for text in texts {

@@ -22,8 +22,8 @@ pub(super) struct SharedMemory {
     budget: Rc<Budget>,
 }
 
-/// Topics of one sensor in shared memory. Announcements do not have the length of samples: topics are created for an LMS, and
-/// created again if a longer sample arrives. Their subscribers stay.
+/// Topics of one sensor in shared memory. Announcements do not have the length of samples: topics are created for an
+/// LMS, and created again if a longer sample arrives. Their subscribers stay.
 pub(super) struct SharedTopics {
     /// By topic.
     topics: [Option<Made>; Topic::ALL.len()],
@@ -50,15 +50,16 @@ struct Made {
     share: Share,
 }
 
-/// Number of times that limits are raised to exactly what is needed. After that, they are raised to the maximum, because a
-/// sender could require one more beam with each sample.
+/// Number of times that limits are raised to exactly what is needed. After that, they are raised to the maximum,
+/// because a sender could require one more beam with each sample.
 const WIDENED_EXACTLY: u32 = 4;
 
-/// Takes the lock of the domain's listener. All topics are created with `limits`, and take at most `memory` bytes together.
+/// Takes the lock of the domain's listener. All topics are created with `limits`, and take at most `memory` bytes
+/// together.
 ///
-/// Returns [`Kind::Configuration`] if `memory` is too small for a sensor, and [`Kind::DomainHeld`] if another listener has
-/// the lock. Returns [`Kind::Short`] if there is no memory for even one sensor, and [`Kind::Failed`] if shared memory
-/// refuses.
+/// Returns [`Kind::Configuration`] if `memory` is too small for a sensor, and [`Kind::DomainHeld`] if another listener
+/// has the lock. Returns [`Kind::Short`] if there is no memory for even one sensor, and [`Kind::Failed`] if shared
+/// memory refuses.
 pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<Publication, Failure> {
     // With a lower limit, fewer subscribers can attach.
     let _ = raise_descriptor_limit();
@@ -128,7 +129,8 @@ impl SharedTopics {
         })
     }
 
-    /// Creates `topic` again if it has no room for `payload`. A sample that is still too long is counted when it is published.
+    /// Creates `topic` again if it has no room for `payload`. A sample that is still too long is counted when it is
+    /// published.
     fn make_room(&mut self, topic: Topic, payload: CheckedPayload<'_>) {
         let Some(limits) = self.wider(topic, payload) else { return };
         if !has_memory(topic, &limits) {

@@ -194,8 +194,8 @@ impl<'a> Report<'a> {
         self.write_counters(gateways, &[])
     }
 
-    /// Prints the counters. On a terminal, draws over the previous ones. `others` are further reasons for which datagrams
-    /// were refused.
+    /// Prints the counters. On a terminal, draws over the previous ones. `others` are further reasons for which
+    /// datagrams were refused.
     pub(super) fn stats(
         &mut self,
         gateways: &GatewayTable,

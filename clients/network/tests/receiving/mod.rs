@@ -1,5 +1,5 @@
-//! A machine with a listener that publishes, and a robot that subscribes to the zones, in virtual time. Topics are queues in
-//! memory.
+//! A machine with a listener that publishes, and a robot that subscribes to the zones, in virtual time. Topics are
+//! queues in memory.
 
 use std::collections::VecDeque;
 

@@ -1,5 +1,5 @@
-//! A machine with a hub of two sensors and a gateway, in virtual time. Sensors fall silent, and hub and gateway restart. Keeps
-//! everything that was sent.
+//! A machine with a hub of two sensors and a gateway, in virtual time. Sensors fall silent, and hub and gateway
+//! restart. Keeps everything that was sent.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU64;

@@ -1,5 +1,5 @@
-//! Writes the datagrams of a gateway: numbers each sample, and seals it in one datagram or in parts. Without a queue, it
-//! transmits a sample at once. With a queue, the newest sample of each topic waits until it is taken.
+//! Writes the datagrams of a gateway: numbers each sample, and seals it in one datagram or in parts. Without a queue,
+//! it transmits a sample at once. With a queue, the newest sample of each topic waits until it is taken.
 
 use std::collections::VecDeque;
 
@@ -10,8 +10,8 @@ use crate::lan::{Key, Stamp};
 
 /// Destination of datagrams: sockets, or a model of a network.
 pub trait Transmit {
-    /// Sends a whole datagram to the group with this last byte, and to the port that is `above` ports after the usual one.
-    /// Returns whether it was sent. If not, its number counts as failed, and receivers count it as lost.
+    /// Sends a whole datagram to the group with this last byte, and to the port that is `above` ports after the usual
+    /// one. Returns whether it was sent. If not, its number counts as failed, and receivers count it as lost.
     fn transmit(&mut self, datagram: &[u8], group: u8, above: u8) -> bool;
 }
 
@@ -118,9 +118,9 @@ impl Rows {
         numbered.map(|(number, row)| (Topic::of_number(number as u8), row))
     }
 
-    /// Writes `payload`, which waited with `head`, to the start of `room`, and returns its length. An announcement gets the
-    /// numbers of this moment: with those of the moment at which it began to wait, a receiver that starts late would count
-    /// samples as lost that were sent before.
+    /// Writes `payload`, which waited with `head`, to the start of `room`, and returns its length. An announcement gets
+    /// the numbers of this moment: with those of the moment at which it began to wait, a receiver that starts late
+    /// would count samples as lost that were sent before.
     fn write(&self, head: &Head, payload: &[u8], room: &mut [u8]) -> Option<usize> {
         if head.topic == Announce::NUMBER {
             return self.updated(&Announce::unpack(payload)?).pack(room);
@@ -171,7 +171,8 @@ impl DatagramWriter {
         rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].replaced)
     }
 
-    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none waits.
+    /// Takes the sample that has waited for longest, numbers it, and returns it as it is sent at `now`. `None` if none
+    /// waits.
     pub(super) fn take_next(&mut self, now: Stamp) -> Option<Handed<'_>> {
         let Queue { waiting, last } = self.queue.as_mut()?;
         let (head, payload) = waiting.take()?;
@@ -296,8 +297,8 @@ impl DatagramWriter {
         self.sensors.iter()
     }
 
-    /// Sends the payload that `pack` writes, under the next number of this sensor and topic. `head` has no hub, epoch and
-    /// sequence number yet. A failure uses the number up. With a queue, the payload waits and gets no number yet.
+    /// Sends the payload that `pack` writes, under the next number of this sensor and topic. `head` has no hub, epoch
+    /// and sequence number yet. A failure uses the number up. With a queue, the payload waits and gets no number yet.
     pub(super) fn send(
         &mut self,
         head: Head,
@@ -338,11 +339,11 @@ impl DatagramWriter {
         self.unfit += u64::from(payload.is_none());
     }
 
-    /// Sends the payload of `len` bytes in the buffer, in as few parts as possible. Returns the bytes of all datagrams if all
-    /// were sent.
+    /// Sends the payload of `len` bytes in the buffer, in as few parts as possible. Returns the bytes of all datagrams
+    /// if all were sent.
     ///
-    /// The parts are sealed in place. The header of a part overwrites the end of the part before it, which was sent already. Its
-    /// MAC overwrites the start of the part after it, which is restored afterward.
+    /// The parts are sealed in place. The header of a part overwrites the end of the part before it, which was sent
+    /// already. Its MAC overwrites the start of the part after it, which is restored afterward.
     fn send_sealed(&mut self, head: Head, len: usize, group: u8, to: &mut impl Transmit) -> Option<usize> {
         let room = self.longest - self.form.overhead();
         let parts = len.div_ceil(room).max(1);
@@ -385,8 +386,8 @@ impl DatagramWriter {
     }
 }
 
-/// Returns the stamp of a sample with this `head` that is sent at `now`. Announcements and statuses have the time at which they
-/// are sent, however long they waited, because receivers compare clocks by them.
+/// Returns the stamp of a sample with this `head` that is sent at `now`. Announcements and statuses have the time at
+/// which they are sent, however long they waited, because receivers compare clocks by them.
 fn stamp_ns(head: &Head, now: Stamp) -> u64 {
     match Topic::of_number(head.topic) {
         None | Some(Topic::Status) => now.wall_ns,
@@ -405,8 +406,8 @@ const MAX_SAMPLE_LEN: usize = HEAD + u16::MAX as usize;
 /// Number of counted streams: announcements, and the topics by their numbers.
 const KINDS: usize = 1 + Topic::ALL.len();
 
-/// Queue that holds only the newest sample of each sensor and topic. When the network is slow or down, a newer sample replaces
-/// the older one, so nothing stale is sent. Topics are served in the order in which they started to wait.
+/// Queue that holds only the newest sample of each sensor and topic. When the network is slow or down, a newer sample
+/// replaces the older one, so nothing stale is sent. Topics are served in the order in which they started to wait.
 #[derive(Default)]
 struct LatestQueue {
     slots: Vec<Slot>,

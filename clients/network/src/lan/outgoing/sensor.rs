@@ -34,8 +34,8 @@ struct Stream {
     is_unknown: bool,
 }
 
-/// Counts the revolutions of a rotating scanner, for thinning. The telegrams that complete them have sequence numbers with gaps,
-/// which may all have the same length.
+/// Counts the revolutions of a rotating scanner, for thinning. The telegrams that complete them have sequence numbers
+/// with gaps, which may all have the same length.
 #[derive(Default)]
 struct RevolutionCounter {
     /// Sequence number of the telegram and index of the revolution, of the last revolutions.
@@ -145,7 +145,8 @@ impl Sensor {
         let Sensor { name, streams, last, kind, .. } = self;
         let stream = &mut streams[topic as usize];
         let Some(header) = sample.header.copied() else {
-            // A silence has no header of its own. It gets that of the last sample, if its number still belongs to this sensor.
+            // A silence has no header of its own. It gets that of the last sample, if its number still belongs to this
+            // sensor.
             let last = stream.last.filter(|last| writer.is_claimed(last.sensor, name));
             if let Some(last) = last.filter(|_| stream.every.is_some()) {
                 stream.is_unknown = true;

@@ -156,7 +156,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
         }
     }
 
-    /// Publishes that the sensor is silent, once per silence, if it was silent at `read`. Sends the history to late joiners.
+    /// Publishes that the sensor is silent, once per silence, if it was silent at `read`. Sends the history to late
+    /// joiners.
     pub(super) fn look(&mut self, read: Stamp) {
         if self.heard_ns.is_some_and(|at_ns| read.monotonic_ns.saturating_sub(at_ns) >= SILENT_AFTER_NS) {
             self.heard_ns = None;
@@ -172,8 +173,8 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.topics.failed()
     }
 
-    /// Publishes a received status. The start of its state is in time of another machine's clock, so it is replaced by the
-    /// time at which the state was received first.
+    /// Publishes a received status. The start of its state is in time of another machine's clock, so it is replaced by
+    /// the time at which the state was received first.
     fn publish_status(&mut self, mut status: Status, header: &Header) {
         let same = self.last_status.filter(|(last, _)| last.state == status.state);
         status.since_ns = same.map_or(header.stamp_first_ns, |(last, _)| last.since_ns);
@@ -210,12 +211,12 @@ fn stamped(header: Header, now: Stamp) -> Header {
     Header { stamp_first_ns: monotonic_ns, stamp_last_ns: monotonic_ns, wall_ns, ..header }
 }
 
-/// Numbers and period of one topic. Its numbers continue over runs of the gateway, and restart with each run of the hub, so that
-/// subscribers see what the network lost.
+/// Numbers and period of one topic. Its numbers continue over runs of the gateway, and restart with each run of the
+/// hub, so that subscribers see what the network lost.
 #[derive(Default)]
 struct Stream {
-    /// Epoch, sensor's number and sequence number of the last sample. The first sample keeps its sequence number, so that
-    /// subscribers that outlive a listener see what was lost in between.
+    /// Epoch, sensor's number and sequence number of the last sample. The first sample keeps its sequence number, so
+    /// that subscribers that outlive a listener see what was lost in between.
     last: Option<(u32, u8, u32)>,
     arrivals: PeriodEstimator,
 }
@@ -230,10 +231,10 @@ struct LocalNumber {
 }
 
 impl Stream {
-    /// Places `remote`, which is not late, as the next sample of the topic, which process `pid` publishes. All numbers between
-    /// the last one and it are skipped, whether they were lost or not published. In a new run of the gateway, these are all
-    /// numbers before it. If the sensor has another number than before, none is skipped, because they may belong to another
-    /// sensor.
+    /// Places `remote`, which is not late, as the next sample of the topic, which process `pid` publishes. All numbers
+    /// between the last one and it are skipped, whether they were lost or not published. In a new run of the gateway,
+    /// these are all numbers before it. If the sensor has another number than before, none is skipped, because they may
+    /// belong to another sensor.
     fn place(&mut self, remote: &Remote<'_>, pid: u32) -> LocalNumber {
         let head = &remote.head;
         let next = (head.epoch, head.sensor, head.sequence);
@@ -250,14 +251,15 @@ impl Stream {
 }
 
 /// Returns by how much `next` is ahead of `last`, each with its epoch and the sensor's number. `None` if they belong to
-/// different sequences. Late samples are not published, so a lower number belongs to a sender that replaced a silent one.
+/// different sequences. Late samples are not published, so a lower number belongs to a sender that replaced a silent
+/// one.
 fn steps(last: (u32, u8, u32), next: (u32, u8, u32)) -> Option<u32> {
     let steps = next.2.wrapping_sub(last.2);
     ((next.0, next.1) == (last.0, last.1) && steps <= u32::MAX / 2).then_some(steps)
 }
 
-/// Estimates the period at which samples of a topic are sent. A gateway may leave out samples, which its datagrams do not
-/// indicate.
+/// Estimates the period at which samples of a topic are sent. A gateway may leave out samples, which its datagrams do
+/// not indicate.
 #[derive(Default)]
 struct PeriodEstimator {
     last_ns: Option<u64>,
@@ -273,9 +275,9 @@ const MEDIAN_OF: usize = 5;
 const MAX_PERIOD_NS: u64 = 2_500_000_000;
 
 impl PeriodEstimator {
-    /// Records a sample that arrived at `now_ns`, `steps` numbers after the last one; 0 if that is unknown. Returns the period
-    /// in us: the median of the last times, the shorter one of two, or 0 while it is unknown. Lost samples do not extend
-    /// it, because a verdict would otherwise be valid for longer on a bad link than on a good one.
+    /// Records a sample that arrived at `now_ns`, `steps` numbers after the last one; 0 if that is unknown. Returns the
+    /// period in us: the median of the last times, the shorter one of two, or 0 while it is unknown. Lost samples do
+    /// not extend it, because a verdict would otherwise be valid for longer on a bad link than on a good one.
     fn period_us(&mut self, now_ns: u64, steps: u64) -> u32 {
         let before_ns = self.last_ns.replace(now_ns);
         let distance_ns = before_ns.and_then(|before_ns| now_ns.checked_sub(before_ns)?.checked_div(steps));
