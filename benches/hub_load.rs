@@ -1,7 +1,8 @@
-//! What does the hub cost while two sensors stream? Measures its CPU time and its sleeps per telegram, with one
-//! sleeping subscriber per sensor. The baseline is a bare reader of the same ptys that makes only the necessary system
-//! calls and wakes a process per telegram. Each run is long; runs of the hub and of the baseline alternate on the same
-//! two lines. The bench does not measure what subscribers cost, or what happens on a real adapter.
+//! What does the hub cost per telegram? Measures its CPU time and its sleeps while 1, 2 or 4 sensors stream, with one
+//! sleeping subscriber per sensor. The baseline is a bare reader of ptys that makes only the necessary system calls and
+//! wakes a process per telegram. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
+//! time (`support/simultaneous.rs`). The bench does not measure what subscribers cost, or what happens on a real
+//! adapter.
 
 mod support;
 
@@ -10,48 +11,51 @@ use std::thread;
 use std::time::Duration;
 
 use scanhub_schema::{Counter, Status};
-use support::figures::{self, Figure, Target};
-use support::stage::{Child, PATIENCE, SENSORS, Stage};
+use support::figures::{self, SimultaneousFigure, Target};
+use support::simultaneous::{Candidate, Comparison, SETTLING};
+use support::stage::{PATIENCE, Stage};
 use support::truth::Truth;
 use support::usage::Work;
 use support::{Options, Outcome, clock, consumer};
 
 fn main() -> ExitCode {
-    support::main(measure)
+    support::main(|options| {
+        options.sensors(&[1, 2, 4]).into_iter().try_for_each(|sensors| measure(options, sensors))
+    })
 }
 
-fn measure(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let _simulator = stage.simulate(&SENSORS, 500_000)?;
+fn measure(options: &Options, sensors: usize) -> Outcome<()> {
+    let comparison = Comparison::start(options, sensors)?;
     let span = Duration::from_secs(options.seconds(20));
-    // The first hub sets the sensors going; from then on they stream to whoever reads.
-    start_hub(&stage)?.0.guard.kill()?;
-    let (mut hub, mut baseline) = (Series::default(), Series::default());
-    for pair in 0..options.pairs() {
-        if pair % 2 == 0 {
-            hub.push(load_of_hub(&stage, span)?);
-            baseline.push(load_of_baseline(&stage, span)?);
-        } else {
-            baseline.push(load_of_baseline(&stage, span)?);
-            hub.push(load_of_hub(&stage, span)?);
-        }
+    let mut rounds = Vec::new();
+    for round in 0..comparison.rounds(options) {
+        rounds.push(load_of_round(&comparison, round, span)?);
     }
-    let figure = |name, unit, hub, baseline, target| Figure { name, unit, hub, baseline, target };
+    let figure = |name, unit, of: fn(&Load) -> Option<f64>, target| {
+        let series = |candidate: usize| rounds.iter().filter_map(|loads| of(&loads[candidate])).collect();
+        let programs = (0..comparison.candidates.len()).map(series).collect();
+        SimultaneousFigure { name, unit, programs, target }
+    };
     let figures = [
-        figure("CPU time per telegram", "us", hub.busy_us, baseline.busy_us, Target::Ratio(2.0)),
-        figure("of it in threads that read", "us", hub.readers_us, baseline.readers_us, Target::None),
-        figure("sleeps per telegram", "1", hub.sleeps, baseline.sleeps, Target::Most(6.0)),
-        figure("of it in threads that read", "1", hub.readers_sleeps, baseline.readers_sleeps, Target::None),
-        figure("preemptions per telegram", "1", hub.preempted, baseline.preempted, Target::None),
-        figure("counter wakeups per telegram", "1", hub.wakeups, Vec::new(), Target::None),
-        figure("telegrams per run", "1", hub.telegrams, baseline.telegrams, Target::None),
+        figure("CPU time per telegram", "us", |load| load.each(load.all.busy_ns / 1000), Target::Ratio(2.0)),
+        figure(
+            "of it in threads that read",
+            "us",
+            |load| load.each(load.readers.busy_ns / 1000),
+            Target::None,
+        ),
+        figure("sleeps per telegram", "1", |load| load.each(load.all.voluntary), Target::Most(6.0)),
+        figure("of it in threads that read", "1", |load| load.each(load.readers.voluntary), Target::None),
+        figure("preemptions per telegram", "1", |load| load.each(load.all.involuntary), Target::None),
+        figure("counter wakeups per telegram", "1", |load| load.wakeups, Target::None),
+        figure("telegrams per round", "1", |load| Some(load.telegrams), Target::None),
     ];
-    figures::print("hub_load", options.json, &figures);
+    let names = comparison.names();
+    figures::print_simultaneous("hub_load", sensors, options.json, &names, &figures);
     Ok(())
 }
 
-/// One run.
-#[derive(Default)]
+/// Resources that a program used in a round.
 struct Load {
     telegrams: f64,
     all: Work,
@@ -59,91 +63,89 @@ struct Load {
     wakeups: Option<f64>,
 }
 
-/// The figures of all runs, in their order.
-#[derive(Default)]
-struct Series {
-    telegrams: Vec<f64>,
-    busy_us: Vec<f64>,
-    readers_us: Vec<f64>,
-    sleeps: Vec<f64>,
-    readers_sleeps: Vec<f64>,
-    preempted: Vec<f64>,
-    wakeups: Vec<f64>,
-}
-
-impl Series {
-    fn push(&mut self, load: Load) {
-        let each = |count: u64| count as f64 / load.telegrams;
-        self.telegrams.push(load.telegrams);
-        self.busy_us.push(each(load.all.busy_ns) / 1e3);
-        self.readers_us.push(each(load.readers.busy_ns) / 1e3);
-        self.sleeps.push(each(load.all.voluntary));
-        self.readers_sleeps.push(each(load.readers.voluntary));
-        self.preempted.push(each(load.all.involuntary));
-        self.wakeups.extend(load.wakeups);
+impl Load {
+    fn each(&self, count: u64) -> Option<f64> {
+        Some(count as f64 / self.telegrams)
     }
 }
 
-fn load_of_hub(stage: &Stage, span: Duration) -> Outcome<Load> {
-    let (hub, _consumers) = start_hub(stage)?;
+/// Runs all programs, and returns what each used in `span`.
+fn load_of_round(comparison: &Comparison, round: usize, span: Duration) -> Outcome<Vec<Load>> {
+    let sensors = comparison.sensors;
+    let mut running = Vec::new();
+    let mut subscribers = Vec::new();
+    let mut stages = Vec::new();
+    for (number, candidate) in comparison.candidates.iter().enumerate() {
+        let lines = comparison.lines(comparison.place(number, round));
+        let program = candidate.start(lines, sensors, 0)?;
+        if candidate.is_hub() {
+            subscribers.push(candidate.subscribe_to_scans(sensors)?);
+        } else {
+            program.await_line("woken", PATIENCE)?;
+        }
+        running.push(program);
+        stages.push(lines);
+    }
     thread::sleep(SETTLING);
-    let before = counters(stage)?;
-    let mut load = observe(stage, hub.guard.pid(), span)?;
-    let after = counters(stage)?;
-    load.wakeups = Some((after.0 - before.0) / (after.1 - before.1));
-    hub.guard.kill()?;
-    Ok(load)
-}
-
-fn load_of_baseline(stage: &Stage, span: Duration) -> Outcome<Load> {
-    let baseline = stage.bare(&SENSORS, 0)?;
-    baseline.await_line("woken", PATIENCE)?;
-    thread::sleep(SETTLING);
-    let load = observe(stage, baseline.guard.pid(), span)?;
-    baseline.guard.kill()?;
-    Ok(load)
-}
-
-/// The hub and a consumer per sensor, once scans come.
-fn start_hub(stage: &Stage) -> Outcome<(Child, Vec<Child>)> {
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let consumers: Vec<Child> =
-        SENSORS.iter().map(|sensor| stage.consumer("scan", sensor, &[])).collect::<Outcome<_>>()?;
-    consumers.iter().try_for_each(|consumer| consumer.await_line("scan", PATIENCE).map(drop))?;
-    Ok((hub, consumers))
-}
-
-/// What process `pid` uses in `span`, and how many telegrams were sent meanwhile.
-fn observe(stage: &Stage, pid: u32, span: Duration) -> Outcome<Load> {
-    let leader = std::fs::read_to_string(format!("/proc/{pid}/comm"))?;
-    let is_reader = |name: &str| SENSORS.contains(&name);
-    // The baseline's readers have their process's name; its first thread only waits for them.
-    let is_baseline = !leader.starts_with("scanhub");
-    let look = || -> Outcome<(u64, Work, Work)> {
-        let all = Work::of(pid, |_| true)?;
-        Ok((clock::now(), all, if is_baseline { all } else { Work::of(pid, is_reader)? }))
+    let counters = || -> Outcome<Vec<Option<(f64, f64)>>> {
+        let of = |candidate: &Candidate| candidate.is_hub().then(|| counters(&candidate.stage, sensors));
+        comparison.candidates.iter().map(|candidate| of(candidate).transpose()).collect()
     };
+    let look = || -> Outcome<Vec<Look>> {
+        let of = |number: usize| {
+            Look::at(running[number].guard.pid(), comparison.candidates[number].is_hub().then_some(sensors))
+        };
+        (0..running.len()).map(of).collect()
+    };
+    let counted = counters()?;
     let before = look()?;
     thread::sleep(span);
     let after = look()?;
-    let sent: Outcome<Vec<usize>> = SENSORS
-        .iter()
-        .map(|sensor| Ok(Truth::read(&stage.truth(), sensor)?.count(before.0, after.0)))
-        .collect();
-    Ok(Load {
-        telegrams: sent?.iter().sum::<usize>() as f64,
-        all: after.1.since(before.1),
-        readers: after.2.since(before.2),
-        wakeups: None,
-    })
+    let counted = counted.into_iter().zip(counters()?);
+    let mut loads = Vec::new();
+    for (((before, after), counted), stage) in before.iter().zip(&after).zip(counted).zip(stages) {
+        let sent = |sensor: &&str| Ok(Truth::read(&stage.truth(), sensor)?.count(before.now, after.now));
+        let sent = sensors.iter().map(sent).collect::<Outcome<Vec<_>>>()?;
+        loads.push(Load {
+            telegrams: sent.iter().sum::<usize>() as f64,
+            all: after.all.since(before.all),
+            readers: after.readers.since(before.readers),
+            wakeups: match counted {
+                (Some(before), Some(after)) => Some((after.0 - before.0) / (after.1 - before.1)),
+                _ => None,
+            },
+        });
+    }
+    running.into_iter().try_for_each(|program| program.guard.kill())?;
+    Ok(loads)
 }
 
-/// What the hub itself counted: wake-ups and telegrams, of both links. Looked at outside of a run, because who looks is
-/// one consumer more.
-fn counters(stage: &Stage) -> Outcome<(f64, f64)> {
+/// Resources that a process has used since its start.
+struct Look {
+    now: u64,
+    all: Work,
+    readers: Work,
+}
+
+impl Look {
+    /// Reads the counters of `pid`. The reading threads of a hub have the names of its sensors. All threads of the
+    /// baseline are readers, except the first, which only waits for them.
+    fn at(pid: u32, sensors: Option<&[&str]>) -> Outcome<Look> {
+        let now = clock::now();
+        let all = Work::of(pid, |_| true)?;
+        let readers = match sensors {
+            Some(sensors) => Work::of(pid, |name| sensors.contains(&name))?,
+            None => all,
+        };
+        Ok(Look { now, all, readers })
+    }
+}
+
+/// Returns wake-ups and telegrams of all links as the hub has counted them. Called outside of the measured time,
+/// because it is a subscriber more.
+fn counters(stage: &Stage, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
-    for sensor in SENSORS {
+    for sensor in sensors {
         let mut statuses =
             consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(Duration::from_secs(3));
         let status = statuses.next()?.ok_or("no status")?;
@@ -152,6 +154,3 @@ fn counters(stage: &Stage) -> Outcome<(f64, f64)> {
     }
     Ok((sum.0 as f64, sum.1 as f64))
 }
-
-/// Until the rhythm is learned and start-up is over.
-const SETTLING: Duration = Duration::from_secs(2);

@@ -1,7 +1,8 @@
 //! How old is a telegram when a subscriber receives it? Measured from the last byte written into the pty, by the
 //! simulator's own stamp, to the sample in another process that sleeps in the client library, at 37.5 Hz from each of
 //! two sensors. The baseline is a bare chain with the same late read: pty, process, eventfd, process. Sent and received
-//! telegrams are matched by hash. The bench does not measure when a beam was measured, or what an adapter adds.
+//! telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
+//! time (`support/simultaneous.rs`). The bench does not measure when a beam was measured, or what an adapter adds.
 
 mod support;
 
@@ -9,40 +10,44 @@ use std::collections::HashMap;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use support::figures::{self, Figure, Target, percentile};
+use support::figures::{self, SimultaneousFigure, Target, percentile};
+use support::simultaneous::{Candidate, Comparison, SETTLING};
 use support::stage::{Child, Line, PATIENCE, SENSORS, Stage};
 use support::truth::Truth;
 use support::{Options, Outcome};
 
 fn main() -> ExitCode {
-    support::main(measure)
+    support::main(|options| {
+        options.sensors(&[SENSORS.len()]).into_iter().try_for_each(|sensors| measure(options, sensors))
+    })
 }
 
-fn measure(options: &Options) -> Outcome<()> {
-    let stage = Stage::new()?;
-    let simulator = stage.simulate(&SENSORS, 500_000)?;
-    let count = options.count(800);
-    // The first hub sets the sensors going; from then on they stream to whoever reads.
-    through_hub(&stage, SETTLING)?;
-    let (mut hub, mut baseline) = (Vec::new(), Vec::new());
-    for pair in 0..options.pairs() {
-        if pair % 2 == 0 {
-            hub.push(through_hub(&stage, count)?);
-            baseline.push(through_baseline(&stage, count)?);
-        } else {
-            baseline.push(through_baseline(&stage, count)?);
-            hub.push(through_hub(&stage, count)?);
-        }
+fn measure(options: &Options, sensors: usize) -> Outcome<()> {
+    let comparison = Comparison::start(options, sensors)?;
+    let count = options.count((options.seconds(20) * RATE_MHZ / 1000) as usize);
+    let mut rounds = Vec::new();
+    for round in 0..comparison.rounds(options) {
+        rounds.push(receive_round(&comparison, round, count)?);
     }
-    drop(simulator);
-    let sent = sent(&stage)?;
-    let series = |runs: &[Run]| -> Outcome<Vec<_>> { runs.iter().map(|run| run.latencies(&sent)).collect() };
-    let (hub, baseline) = (series(&hub)?, series(&baseline)?);
-    let figure = |name, of: fn(&Latencies) -> &[f64], part, target| {
-        let at = |runs: &[Latencies]| runs.iter().filter_map(|run| percentile(of(run), part)).collect();
-        Figure { name, unit: "us", hub: at(&hub), baseline: at(&baseline), target }
+    let places = 0..comparison.candidates.len();
+    let sent = places.map(|place| sent(comparison.lines(place), comparison.sensors));
+    let sent = sent.collect::<Outcome<Vec<_>>>()?;
+    let mut latencies = Vec::new();
+    for (round, runs) in rounds.iter().enumerate() {
+        let of = |(number, run): (usize, &Run)| {
+            let is_hub = comparison.candidates[number].is_hub();
+            run.latencies(&sent[comparison.place(number, round)], common_span(runs), is_hub)
+        };
+        latencies.push(runs.iter().enumerate().map(of).collect::<Outcome<Vec<_>>>()?);
+    }
+    let series = |of: &dyn Fn(&Latencies) -> Option<f64>| {
+        let programs = 0..comparison.candidates.len();
+        programs.map(|number| latencies.iter().filter_map(|round| of(&round[number])).collect()).collect()
     };
-    let sizes = |runs: &[Latencies]| runs.iter().map(|run| run.whole.len() as f64).collect();
+    let figure = |name, of: fn(&Latencies) -> &[f64], part, target| {
+        let programs = series(&|run| percentile(of(run), part));
+        SimultaneousFigure { name, unit: "us", programs, target }
+    };
     let figures = [
         figure("p50", |run| &run.whole, 0.5, Target::Ratio(1.5)),
         figure("p90", |run| &run.whole, 0.9, Target::None),
@@ -50,19 +55,18 @@ fn measure(options: &Options) -> Outcome<()> {
         figure("max", |run| &run.whole, 1.0, Target::None),
         figure("until read, p50", |run| &run.read, 0.5, Target::None),
         figure("until read, p99", |run| &run.read, 0.99, Target::None),
-        Figure {
+        SimultaneousFigure {
             name: "telegrams",
             unit: "1",
-            hub: sizes(&hub),
-            baseline: sizes(&baseline),
+            programs: series(&|run| Some(run.whole.len() as f64)),
             target: Target::None,
         },
     ];
-    figures::print("latency", options.json, &figures);
+    figures::print_simultaneous("latency", sensors, options.json, &comparison.names(), &figures);
     Ok(())
 }
 
-/// What was received in a run.
+/// Telegrams received through one program in a round.
 struct Run(Vec<Arrived>);
 
 struct Arrived {
@@ -70,22 +74,36 @@ struct Arrived {
     hash: String,
     /// When whoever has the pty open had its last byte.
     read_ns: u64,
-    /// When the consumer had it.
+    /// When the subscriber had it.
     at_ns: u64,
 }
 
 impl Run {
-    /// Microseconds from sent to received and from sent to read, each sorted. The first telegrams are left out: the
-    /// reader had to learn how long one takes.
-    fn latencies(&self, sent: &HashMap<(usize, String), u64>) -> Outcome<Latencies> {
+    /// Returns the time from which the run counts, and its end. They come from the sensor that started to stream last
+    /// and from the one that ended first.
+    fn span(&self) -> (u64, u64) {
+        let mut ends = HashMap::<usize, (u64, u64)>::new();
+        for arrived in &self.0 {
+            ends.entry(arrived.sensor).or_insert((arrived.at_ns, 0)).1 = arrived.at_ns;
+        }
+        let first = ends.values().map(|ends| ends.0).max().unwrap_or_default();
+        let last = ends.values().map(|ends| ends.1).min().unwrap_or_default();
+        (first + SETTLING.as_nanos() as u64, last)
+    }
+
+    /// Returns microseconds from sent to received and from sent to read of the telegrams received in `span`. A hub
+    /// verifies checksums, so all its telegrams were sent. A baseline without checksums may receive parts of two.
+    fn latencies(&self, sent: &Sent, span: (u64, u64), is_hub: bool) -> Outcome<Latencies> {
         let mut latencies = Latencies::default();
-        for sensor in 0..SENSORS.len() {
-            for arrived in self.0.iter().filter(|arrived| arrived.sensor == sensor).skip(SETTLING) {
-                let key = (sensor, arrived.hash.clone());
-                let sent_ns = *sent.get(&key).ok_or("received what was not sent")? as f64;
-                latencies.whole.push((arrived.at_ns as f64 - sent_ns) / 1e3);
-                latencies.read.push((arrived.read_ns as f64 - sent_ns) / 1e3);
-            }
+        for arrived in self.0.iter().filter(|arrived| (span.0..=span.1).contains(&arrived.at_ns)) {
+            let Some(&sent_ns) = sent.get(&(arrived.sensor, arrived.hash.clone())) else {
+                if is_hub {
+                    return Err("the hub delivered a telegram that was not sent".into());
+                }
+                continue;
+            };
+            latencies.whole.push((arrived.at_ns as f64 - sent_ns as f64) / 1e3);
+            latencies.read.push((arrived.read_ns as f64 - sent_ns as f64) / 1e3);
         }
         latencies.whole.sort_by(f64::total_cmp);
         latencies.read.sort_by(f64::total_cmp);
@@ -93,41 +111,68 @@ impl Run {
     }
 }
 
+/// Returns the span in which all runs of a round count.
+fn common_span(runs: &[Run]) -> (u64, u64) {
+    let spans = runs.iter().map(Run::span);
+    spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
+}
+
+/// Latencies of a run, each series sorted.
 #[derive(Default)]
 struct Latencies {
     whole: Vec<f64>,
     read: Vec<f64>,
 }
 
-fn through_hub(stage: &Stage, count: usize) -> Outcome<Run> {
-    let count = count + SETTLING;
-    let hub = stage.hub(&SENSORS)?;
-    hub.await_line("ready", PATIENCE)?;
-    let start = |sensor: &&str| stage.consumer("telegram", sensor, &[&count.to_string()]);
-    let consumers: Vec<Child> = SENSORS.iter().map(start).collect::<Outcome<_>>()?;
+/// Runs all programs until each has received `count` telegrams of each sensor after the start. Returns them.
+fn receive_round(comparison: &Comparison, round: usize, count: usize) -> Outcome<Vec<Run>> {
+    let count = count + (SETTLING.as_millis() as u64 * RATE_MHZ / 1_000_000) as usize;
+    let start = |(number, candidate): (usize, &Candidate)| -> Outcome<_> {
+        let program =
+            candidate.start(comparison.lines(comparison.place(number, round)), comparison.sensors, count)?;
+        let subscribe = |sensor: &&str| candidate.stage.consumer("telegram", sensor, &[&count.to_string()]);
+        let subscribed = if candidate.is_hub() { comparison.sensors } else { &[] };
+        Ok((program, subscribed.iter().map(subscribe).collect::<Outcome<Vec<_>>>()?))
+    };
+    let running = comparison.candidates.iter().enumerate().map(start).collect::<Outcome<Vec<_>>>()?;
+    let mut runs = Vec::new();
+    for (candidate, (program, subscribers)) in comparison.candidates.iter().zip(&running) {
+        let run = match candidate.is_hub() {
+            true => through_hub(subscribers, count),
+            false => through_baseline(program, comparison.sensors.len(), count),
+        };
+        runs.push(run.map_err(|error| format!("{}: {error}", candidate.name))?);
+    }
+    for (candidate, (program, _)) in comparison.candidates.iter().zip(running) {
+        match candidate.is_hub() {
+            true => program.guard.kill()?,
+            false => program.guard.wait()?,
+        }
+    }
+    Ok(runs)
+}
+
+fn through_hub(subscribers: &[Child], count: usize) -> Outcome<Run> {
     let mut run = Run(Vec::new());
-    for (sensor, consumer) in consumers.iter().enumerate() {
-        for line in consumer.lines_until("end", patience(count))? {
+    for (sensor, subscriber) in subscribers.iter().enumerate() {
+        for line in subscriber.lines_until("end", patience(count))? {
             if let ["telegram", _, _, _, _, _, hash, _] = line.words()[..] {
                 let (hash, at_ns, read_ns) = (hash.to_owned(), line.number(2)?, line.number(7)?);
                 run.0.push(Arrived { sensor, hash, read_ns, at_ns });
             }
         }
     }
-    hub.guard.kill()?;
     Ok(run)
 }
 
-fn through_baseline(stage: &Stage, count: usize) -> Outcome<Run> {
-    let count = count + SETTLING;
-    let baseline = stage.bare(&SENSORS, count)?;
+fn through_baseline(baseline: &Child, sensors: usize, count: usize) -> Outcome<Run> {
     let lines = baseline.lines_until("end", patience(count))?;
     let of = |what: &str, sensor: usize| -> Vec<&Line> {
         let number = sensor.to_string();
         lines.iter().filter(|line| line.words().get(..2) == Some(&[what, &number])).collect()
     };
     let mut run = Run(Vec::new());
-    for sensor in 0..SENSORS.len() {
+    for sensor in 0..sensors {
         // The wake-up carries no bytes: the nth is that of the nth telegram.
         for (read, woken) in of("read", sensor).into_iter().zip(of("woken", sensor)) {
             let (hash, at_ns, read_ns) = (read.words()[2].to_owned(), woken.number(2)?, read.number(3)?);
@@ -138,9 +183,11 @@ fn through_baseline(stage: &Stage, count: usize) -> Outcome<Run> {
 }
 
 /// When each telegram was sent, by sensor and hash.
-fn sent(stage: &Stage) -> Outcome<HashMap<(usize, String), u64>> {
+type Sent = HashMap<(usize, String), u64>;
+
+fn sent(stage: &Stage, sensors: &[&str]) -> Outcome<Sent> {
     let mut sent = HashMap::new();
-    for (number, sensor) in SENSORS.iter().enumerate() {
+    for (number, sensor) in sensors.iter().enumerate() {
         let truth = Truth::read(&stage.truth(), sensor)?;
         sent.extend(truth.sent.into_iter().map(|one| ((number, one.hash), one.at_ns)));
     }
@@ -151,5 +198,5 @@ fn patience(count: usize) -> Duration {
     PATIENCE + Duration::from_millis(50) * count as u32
 }
 
-/// Telegrams at the start of a run that do not count.
-const SETTLING: usize = 40;
+/// Telegrams per second of a sensor, times 1000.
+const RATE_MHZ: u64 = 37_500;

@@ -17,6 +17,7 @@ use std::thread;
 use std::time::Duration;
 
 use supervisor::Supervisor;
+use support::baseline;
 use support::figures::{self, Figure, Target};
 use support::stage::{Child, PATIENCE, PROGRAM, SENSORS, Stage};
 use support::truth::Truth;
@@ -145,7 +146,7 @@ impl Runs<'_> {
 }
 
 fn start_baseline(stage: &Stage) -> Outcome<Start> {
-    let baseline = stage.bare(&SENSORS, 0)?;
+    let baseline = stage.bare(&SENSORS, 0, baseline::LEAD)?;
     let up_ns = baseline.await_line("ready", PATIENCE)?.at_ns;
     let mut first_ns = [0; 2];
     while first_ns.contains(&0) {

@@ -24,9 +24,10 @@ use scanhub_drivers::lms::variant::Baud;
 use super::stage::Guard;
 use super::{Outcome, PART, clock, truth};
 
-/// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. The
-/// first line says that it is up; at the end it prints the hash of each telegram and when it was read.
-pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
+/// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. It
+/// wakes up `lead` nanoseconds before the expected end of a telegram. The first line says that it is up; at the end it
+/// prints the hash of each telegram and when it was read.
+pub(crate) fn chain(ports: &[&str], count: usize, lead: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
     for (number, port) in ports.iter().enumerate() {
@@ -37,7 +38,7 @@ pub(crate) fn chain(ports: &[&str], count: usize) -> Outcome<()> {
     println!("ready");
     let threads: Vec<_> = ends
         .into_iter()
-        .map(|(line, wake)| thread::spawn(move || read_or_end(&line, &wake, count)))
+        .map(|(line, wake)| thread::spawn(move || read_or_end(&line, &wake, count, lead)))
         .collect();
     for (number, thread) in threads.into_iter().enumerate() {
         let telegrams = thread.join().map_err(|_| "a reader panicked")?;
@@ -79,19 +80,19 @@ pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outco
 }
 
 /// Reads, and ends the whole process on an error: with one reader less, the baseline would be too low.
-fn read_or_end(line: &Line, wake: &OwnedFd, count: usize) -> Vec<([u8; LENGTH], u64)> {
-    read(line, wake, count).unwrap_or_else(|error| {
+fn read_or_end(line: &Line, wake: &OwnedFd, count: usize, lead: u64) -> Vec<([u8; LENGTH], u64)> {
+    read(line, wake, count, lead).unwrap_or_else(|error| {
         eprintln!("baseline: {error}");
         std::process::exit(1)
     })
 }
 
 /// The read loop. What it keeps of each telegram, it keeps after the wake-up, in the pause before the next telegram.
-fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<([u8; LENGTH], u64)>, String> {
+fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u8; LENGTH], u64)>, String> {
     let words = |error: Box<dyn std::error::Error>| error.to_string();
     line.await_pause(PAUSE).map_err(words)?;
     let mut kept = Vec::with_capacity(count);
-    let mut duration = TelegramDuration::default();
+    let mut duration = TelegramDuration { shortest: 2 * lead, ..TelegramDuration::default() };
     let mut telegram = [0; LENGTH];
     while count == 0 || kept.len() < count {
         let mut filled = 0;
@@ -104,7 +105,7 @@ fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<([u8; LENGTH],
             if fresh {
                 first = clock::now();
                 if let Some(duration) = duration.known.filter(|_| filled < LENGTH) {
-                    clock::rest(first + duration - LEAD);
+                    clock::rest(first + duration - lead);
                     // As in the hub: bytes have certainly arrived, so there is no need to poll.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
                 }
@@ -128,6 +129,8 @@ fn read(line: &Line, wake: impl AsFd, count: usize) -> Result<Vec<([u8; LENGTH],
 /// Duration of a telegram, estimated like in the hub: the minimum of several.
 #[derive(Default)]
 struct TelegramDuration {
+    /// Longest duration, in ns, that is too short for a sleep.
+    shortest: u64,
     known: Option<u64>,
     minimum: Option<u64>,
     counted: u32,
@@ -139,7 +142,8 @@ impl TelegramDuration {
         self.counted += 1;
         if self.counted >= if self.known.is_none() { 3 } else { 16 } {
             *self = TelegramDuration {
-                known: self.minimum.filter(|&minimum| minimum > 2 * LEAD),
+                known: self.minimum.filter(|&minimum| minimum > self.shortest),
+                shortest: self.shortest,
                 ..TelegramDuration::default()
             };
         }
@@ -150,8 +154,9 @@ impl TelegramDuration {
 const RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
 const LENGTH: usize = 732;
-/// Time before the end of a telegram at which the hub reads, in ns.
-const LEAD: u64 = 600_000;
+/// Time before the expected end of a telegram at which the baseline wakes up, in ns. It stays as it is when the hub's
+/// own, `lms::LEAD`, changes, so that ratios can be compared with earlier ones.
+pub(crate) const LEAD: u64 = 600_000;
 /// Longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it, in ns.
 const PAUSE: u64 = 6_000_000;
 

@@ -1,8 +1,11 @@
 //! Figures with their spread: a series of values, one per run, next to those of the baseline, with the ratio run by
-//! run; or cells of tables. They are printed as tables, or with `--json` as one line each (`SPREAD` is `{median, least,
-//! most}` or null):
+//! run; figures of programs that ran at the same time; or cells of tables. They are printed as tables, or with `--json`
+//! as one line each (`SPREAD` is `{median, least, most}` or null):
 //!
 //! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
+//! - the same with more keys, one line for each program that ran at the same time as the hub: `sensors`, `program` (its
+//!   name), and `difference` (hub minus program) and `quotient` (hub by program), each `{mean, error}`. `baseline` is
+//!   the spread of this program, and `error` is the standard error of the mean, or null after one round.
 //! - `{class: "cell", bench, table, row, column, value: SPREAD, unit}`
 
 use serde_json::{Value, json};
@@ -15,6 +18,15 @@ pub(crate) struct Figure {
     pub(crate) hub: Vec<f64>,
     /// One value per run of the baseline; empty if the figure has none.
     pub(crate) baseline: Vec<f64>,
+    pub(crate) target: Target,
+}
+
+/// A figure of programs that ran at the same time. The first is the hub, the second the baseline.
+pub(crate) struct SimultaneousFigure {
+    pub(crate) name: &'static str,
+    pub(crate) unit: &'static str,
+    /// One series per program, with one value per round; empty if the program does not have the figure.
+    pub(crate) programs: Vec<Vec<f64>>,
     pub(crate) target: Target,
 }
 
@@ -38,7 +50,7 @@ pub(crate) enum Target {
     Most(f64),
     /// Minimum of the hub's median.
     Least(f64),
-    /// Maximum of the median of the ratios.
+    /// Maximum of the median of the ratios to the baseline.
     Ratio(f64),
 }
 
@@ -78,6 +90,28 @@ impl Figure {
             .collect()
     }
 
+    /// Returns the spreads of the hub, of the baseline and of the ratios.
+    fn spreads(&self) -> [Option<Spread>; 3] {
+        [&self.hub, &self.baseline, &self.ratios()].map(|series| Spread::of(series))
+    }
+
+    /// Returns the line of JSON.
+    fn json(&self, bench: &str) -> Value {
+        let [hub, baseline, ratio] = self.spreads().map(|spread| spread.map(|spread| spread.json()));
+        let verdict = self.verdict();
+        json!({
+            "class": "measurement", "bench": bench, "name": self.name, "unit": self.unit,
+            "runs": self.hub.len(), "hub": hub, "baseline": baseline, "ratio": ratio,
+            "target": verdict.as_ref().map(|(words, _)| words), "met": verdict.as_ref().map(|(_, met)| met),
+        })
+    }
+
+    /// Returns the target and whether it was met, as they are in tables.
+    fn verdict_text(&self) -> String {
+        self.verdict()
+            .map_or(String::new(), |(words, met)| format!("{words}: {}", if met { "met" } else { "MISSED" }))
+    }
+
     /// Returns the target as text, and whether it was met.
     fn verdict(&self) -> Option<(String, bool)> {
         match self.target {
@@ -95,25 +129,97 @@ pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
         println!("{:34} {:>30} {:>30} {:>22}  target", bench, "hub", "baseline", "ratio");
     }
     for figure in figures {
-        let spreads = [&figure.hub, &figure.baseline, &figure.ratios()].map(|series| Spread::of(series));
-        let verdict = figure.verdict();
         if json {
-            let [hub, baseline, ratio] = spreads.map(|spread| spread.map(|spread| spread.json()));
-            let line = json!({
-                "class": "measurement", "bench": bench, "name": figure.name, "unit": figure.unit,
-                "runs": figure.hub.len(), "hub": hub, "baseline": baseline, "ratio": ratio,
-                "target": verdict.as_ref().map(|(words, _)| words), "met": verdict.as_ref().map(|(_, met)| met),
-            });
-            println!("{line}");
+            println!("{}", figure.json(bench));
         } else {
             let [hub, baseline, ratio] =
-                spreads.map(|spread| spread.map_or("-".into(), |spread| spread.text()));
-            let verdict = verdict.map_or(String::new(), |(words, met)| {
-                format!("{words}: {}", if met { "met" } else { "MISSED" })
-            });
+                figure.spreads().map(|spread| spread.map_or("-".into(), |spread| spread.text()));
+            let verdict = figure.verdict_text();
             let name = format!("{}, {}", figure.name, figure.unit);
             println!("{name:34} {hub:>30} {baseline:>30} {ratio:>22}  {verdict}");
         }
+    }
+}
+
+impl SimultaneousFigure {
+    /// Returns the figure with program number `number` in the place of the baseline. Only the baseline has a target.
+    fn against(&self, number: usize) -> Figure {
+        Figure {
+            name: self.name,
+            unit: self.unit,
+            hub: self.programs[0].clone(),
+            baseline: self.programs[number].clone(),
+            target: if number == 1 { self.target } else { Target::None },
+        }
+    }
+
+    /// Returns by how much the hub's values are greater than those of program number `number`.
+    fn difference(&self, number: usize) -> Option<Mean> {
+        let pairs = self.programs[0].iter().zip(&self.programs[number]);
+        Mean::of(&pairs.map(|(hub, program)| hub - program).collect::<Vec<_>>())
+    }
+}
+
+/// Prints `figures` of programs that ran at the same time and have these names.
+pub(crate) fn print_simultaneous(
+    bench: &str,
+    sensors: usize,
+    json: bool,
+    names: &[&str],
+    figures: &[SimultaneousFigure],
+) {
+    if !json {
+        let title = format!("{bench}, sensors: {sensors}");
+        println!("{title:42} {:>26} {:>20} {:>20}  target", "median", "hub minus it", "hub / it");
+    }
+    for figure in figures {
+        if json {
+            for (number, name) in names.iter().enumerate().skip(1) {
+                let against = figure.against(number);
+                let mut line = against.json(bench);
+                line["sensors"] = json!(sensors);
+                line["program"] = json!(name);
+                line["difference"] = json!(figure.difference(number).map(|mean| mean.json()));
+                line["quotient"] = json!(Mean::of(&against.ratios()).map(|mean| mean.json()));
+                println!("{line}");
+            }
+            continue;
+        }
+        let title = format!("{}, {}", figure.name, figure.unit);
+        println!("{}", format!("{title:113}{}", figure.against(1).verdict_text()).trim_end());
+        for (number, (name, values)) in names.iter().zip(&figure.programs).enumerate() {
+            let against = figure.against(number);
+            let text = |mean: Option<Mean>| mean.map_or("-".into(), |mean| mean.text());
+            let [difference, ratio] = match number {
+                0 => [String::new(), String::new()],
+                _ => [text(figure.difference(number)), text(Mean::of(&against.ratios()))],
+            };
+            let median = Spread::of(values).map_or("-".into(), |spread| spread.text());
+            println!("  {name:40} {median:>26} {difference:>20} {ratio:>20}");
+        }
+    }
+}
+
+/// Mean of a series and its standard error, which one value does not have.
+struct Mean(f64, Option<f64>);
+
+impl Mean {
+    /// Returns the mean of `values`; `None` if there are none.
+    fn of(values: &[f64]) -> Option<Mean> {
+        let count = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / count;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        let error = (values.len() > 1).then(|| (squares / (count - 1.0) / count).sqrt());
+        (!values.is_empty()).then_some(Mean(mean, error))
+    }
+
+    fn text(&self) -> String {
+        let error = self.1.map_or(String::new(), |error| format!(" +- {}", short(error)));
+        format!("{}{error}", short(self.0))
+    }
+
+    fn json(&self) -> Value {
+        json!({ "mean": self.0, "error": self.1 })
     }
 }
 

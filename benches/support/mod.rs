@@ -8,6 +8,7 @@ pub(crate) mod baseline;
 pub(crate) mod clock;
 pub(crate) mod consumer;
 pub(crate) mod figures;
+pub(crate) mod simultaneous;
 pub(crate) mod source;
 pub(crate) mod stage;
 pub(crate) mod truth;
@@ -64,7 +65,7 @@ pub(crate) fn play(words: &[&str]) -> Outcome<()> {
         }
         ["hold", domain, sensor, count] => consumer::hold(domain, sensor, count.parse()?),
         ["stay", domain, sensor, count] => consumer::stay(domain, sensor, count.parse()?),
-        ["bare", count, ref ports @ ..] => baseline::chain(ports, count.parse()?),
+        ["bare", count, lead, ref ports @ ..] => baseline::chain(ports, count.parse()?, lead.parse()?),
         ["sleeper", number, count] => baseline::sleeper(number, count.parse()?),
         ["host", "blindly", port, rate] => baseline::start_blindly(port.as_ref(), rate.parse()?),
         ["host", port, rate] => baseline::start(port.as_ref(), rate.parse()?),
@@ -85,6 +86,9 @@ pub(crate) struct Options {
     pairs: Option<usize>,
     seconds: Option<u64>,
     count: Option<usize>,
+    sensors: Option<usize>,
+    /// The program of another build, to be measured at the same time.
+    pub(crate) beside: Option<String>,
 }
 
 impl Options {
@@ -103,9 +107,12 @@ impl Options {
                 "--pairs" => options.pairs = Some(number(word, value()?)?),
                 "--seconds" => options.seconds = Some(number(word, value()?)?),
                 "--count" => options.count = Some(number(word, value()?)?),
+                "--sensors" => options.sensors = Some(number(word, value()?)?),
+                "--beside" => options.beside = Some(value()?.clone()),
                 "--bench" => {}
                 _ => {
-                    let known = "--json, --quick, --pairs N, --seconds N, --count N";
+                    let known =
+                        "--json, --quick, --pairs N, --seconds N, --count N, --sensors N, --beside PROGRAM";
                     return Err(format!("{word} is not an option of this bench; use {known}").into());
                 }
             }
@@ -113,7 +120,7 @@ impl Options {
         Ok(options)
     }
 
-    /// Returns the number of pairs, each a run of the hub and one of the baseline.
+    /// Returns the number of pairs, each a run of the hub and one of the baseline, or of rounds, in which all run.
     pub(crate) fn pairs(&self) -> usize {
         self.pairs_or(5)
     }
@@ -126,6 +133,11 @@ impl Options {
     /// Returns the length of a run in seconds.
     pub(crate) fn seconds(&self, default: u64) -> u64 {
         self.seconds.unwrap_or(default).clamp(1, 3600)
+    }
+
+    /// Returns the numbers of sensors to measure with, one after the other.
+    pub(crate) fn sensors(&self, default: &[usize]) -> Vec<usize> {
+        self.sensors.map_or(default.to_vec(), |sensors| vec![sensors.clamp(1, stage::ALL_AROUND.len())])
     }
 
     /// Returns the number of telegrams or repetitions.

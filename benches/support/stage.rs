@@ -22,13 +22,22 @@ pub(crate) struct Stage {
 impl Stage {
     /// Creates the domain and the directory of this process.
     pub(crate) fn new() -> Outcome<Stage> {
-        let stage = Stage::of(std::process::id())?;
+        Stage::create(&std::process::id().to_string())
+    }
+
+    /// Creates domain and directory number `number` of this process, for a bench that needs several.
+    pub(crate) fn numbered(number: usize) -> Outcome<Stage> {
+        Stage::create(&format!("{}-{number}", std::process::id()))
+    }
+
+    fn create(owner: &str) -> Outcome<Stage> {
+        let stage = Stage::of(owner)?;
         std::fs::create_dir_all(&stage.directory)?;
         Ok(stage)
     }
 
-    fn of(pid: u32) -> Outcome<Stage> {
-        let name = format!("bench-{pid}");
+    fn of(owner: &str) -> Outcome<Stage> {
+        let name = format!("bench-{owner}");
         let domain = Domain::of_hub(&name, None, &Environment::of_process())?;
         Ok(Stage { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
     }
@@ -37,9 +46,10 @@ impl Stage {
     pub(crate) fn sweep() -> Outcome<()> {
         for entry in std::fs::read_dir(std::env::temp_dir())? {
             let name = entry?.file_name().to_string_lossy().into_owned();
-            let pid = name.strip_prefix("scanhub-bench-").and_then(|pid| pid.parse().ok());
-            if let Some(pid) = pid.filter(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
-                drop(Stage::of(pid)?);
+            let Some(owner) = name.strip_prefix("scanhub-bench-") else { continue };
+            let pid = owner.split('-').next().and_then(|pid| pid.parse::<u32>().ok());
+            if pid.is_some_and(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
+                drop(Stage::of(owner)?);
             }
         }
         Ok(())
@@ -112,13 +122,18 @@ impl Stage {
 
     /// Returns the command that starts the hub.
     pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
+        self.hub_command_on(self, program, sensors)
+    }
+
+    /// Returns the command that starts the hub with the sensors of another stage, `lines`.
+    pub(crate) fn hub_command_on(&self, lines: &Stage, program: &str, sensors: &[&str]) -> Command {
         let mut command = Command::new(program);
         command.args(["run", "--domain", self.domain.name()]);
         // The state of the hub is removed with the stage.
         command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
             // Without the time and the shared memory of a search.
-            command.args(["--link", &format!("{sensor}={},family=lms", self.port(sensor))]);
+            command.args(["--link", &format!("{sensor}={},family=lms", lines.port(sensor))]);
         });
         command
     }
@@ -128,12 +143,13 @@ impl Stage {
         self.part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
     }
 
-    /// Starts this program as the baseline that reads `count` telegrams from each port.
-    pub(crate) fn bare(&self, sensors: &[&str], count: usize) -> Outcome<Child> {
+    /// Starts this program as the baseline that reads `count` telegrams from each port, and wakes up `lead` nanoseconds
+    /// before the expected end of each.
+    pub(crate) fn bare(&self, sensors: &[&str], count: usize, lead: u64) -> Outcome<Child> {
         let ports: Vec<String> = sensors.iter().map(|sensor| self.port(sensor)).collect();
         let mut words: Vec<&str> = ports.iter().map(String::as_str).collect();
-        let count = count.to_string();
-        words.splice(0..0, ["bare", &count]);
+        let (count, lead) = (count.to_string(), lead.to_string());
+        words.splice(0..0, ["bare", &count, &lead]);
         self.part(&words)
     }
 
@@ -159,6 +175,8 @@ impl Drop for Stage {
 
 /// The two sensors of a vehicle.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+/// The sensors of a vehicle with one on each side.
+pub(crate) const ALL_AROUND: [&str; 4] = ["front", "rear", "left", "right"];
 /// Number of subscribers of a topic that [`Stage::hub_for_crowd`] has room for.
 pub(crate) const CROWD: usize = 200;
 /// Timeout, far longer than any step takes.
