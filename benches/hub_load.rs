@@ -11,7 +11,7 @@ use std::thread;
 use std::time::Duration;
 
 use scanhub_schema::{Counter, Status};
-use support::figures::{self, SimultaneousFigure, Target};
+use support::figures::{self, SimultaneousFigure, Target, percentile};
 use support::simultaneous::{Candidate, Comparison, SETTLING};
 use support::stage::{PATIENCE, Stage};
 use support::truth::Truth;
@@ -26,13 +26,19 @@ fn main() -> ExitCode {
 
 fn measure(options: &Options, sensors: usize) -> Outcome<()> {
     let comparison = Comparison::start(options, sensors)?;
-    let span = Duration::from_secs(options.seconds(20));
+    let seconds = options.seconds(20);
     let mut rounds = Vec::new();
     for round in 0..comparison.rounds(options) {
-        rounds.push(load_of_round(&comparison, round, span)?);
+        rounds.push(load_of_round(&comparison, round, seconds)?);
     }
     let figure = |name, unit, of: fn(&Load) -> Option<f64>, target| {
-        let series = |candidate: usize| rounds.iter().filter_map(|loads| of(&loads[candidate])).collect();
+        // Other work of the machine makes some seconds far more expensive than most, so the median counts.
+        let in_round = |loads: &Vec<Load>| {
+            let mut seconds: Vec<f64> = loads.iter().filter_map(of).collect();
+            seconds.sort_by(f64::total_cmp);
+            percentile(&seconds, 0.5)
+        };
+        let series = |number: usize| rounds.iter().filter_map(|loads| in_round(&loads[number])).collect();
         let programs = (0..comparison.candidates.len()).map(series).collect();
         SimultaneousFigure { name, unit, programs, target }
     };
@@ -48,14 +54,14 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
         figure("of it in threads that read", "1", |load| load.each(load.readers.voluntary), Target::None),
         figure("preemptions per telegram", "1", |load| load.each(load.all.involuntary), Target::None),
         figure("counter wakeups per telegram", "1", |load| load.wakeups, Target::None),
-        figure("telegrams per round", "1", |load| Some(load.telegrams), Target::None),
+        figure("telegrams per second", "1", |load| Some(load.telegrams), Target::None),
     ];
     let names = comparison.names();
     figures::print_simultaneous("hub_load", sensors, options.json, &names, &figures);
     Ok(())
 }
 
-/// Resources that a program used in a round.
+/// Resources that a program used in a second.
 struct Load {
     telegrams: f64,
     all: Work,
@@ -69,8 +75,8 @@ impl Load {
     }
 }
 
-/// Runs all programs, and returns what each used in `span`.
-fn load_of_round(comparison: &Comparison, round: usize, span: Duration) -> Outcome<Vec<Load>> {
+/// Runs all programs, and returns what each used in each second.
+fn load_of_round(comparison: &Comparison, round: usize, seconds: u64) -> Outcome<Vec<Vec<Load>>> {
     let sensors = comparison.sensors;
     let mut running = Vec::new();
     let mut subscribers = Vec::new();
@@ -98,23 +104,29 @@ fn load_of_round(comparison: &Comparison, round: usize, span: Duration) -> Outco
         (0..running.len()).map(of).collect()
     };
     let counted = counters()?;
-    let before = look()?;
-    thread::sleep(span);
-    let after = look()?;
-    let counted = counted.into_iter().zip(counters()?);
+    let mut looks = vec![look()?];
+    for _ in 0..seconds {
+        thread::sleep(Duration::from_secs(1));
+        looks.push(look()?);
+    }
     let mut loads = Vec::new();
-    for (((before, after), counted), stage) in before.iter().zip(&after).zip(counted).zip(stages) {
-        let sent = |sensor: &&str| Ok(Truth::read(&stage.truth(), sensor)?.count(before.now, after.now));
-        let sent = sensors.iter().map(sent).collect::<Outcome<Vec<_>>>()?;
-        loads.push(Load {
-            telegrams: sent.iter().sum::<usize>() as f64,
-            all: after.all.since(before.all),
-            readers: after.readers.since(before.readers),
-            wakeups: match counted {
-                (Some(before), Some(after)) => Some((after.0 - before.0) / (after.1 - before.1)),
-                _ => None,
-            },
-        });
+    for (number, (counted, stage)) in counted.into_iter().zip(counters()?).zip(stages).enumerate() {
+        let truths = sensors.iter().map(|sensor| Truth::read(&stage.truth(), sensor));
+        let truths = truths.collect::<Outcome<Vec<_>>>()?;
+        let of_second = |looks: &[Vec<Look>]| {
+            let (before, after) = (&looks[0][number], &looks[1][number]);
+            Load {
+                telegrams: truths.iter().map(|truth| truth.count(before.now, after.now)).sum::<usize>()
+                    as f64,
+                all: after.all.since(before.all),
+                readers: after.readers.since(before.readers),
+                wakeups: match counted {
+                    (Some(before), Some(after)) => Some((after.0 - before.0) / (after.1 - before.1)),
+                    _ => None,
+                },
+            }
+        };
+        loads.push(looks.windows(2).map(of_second).filter(|load| load.telegrams > 0.0).collect());
     }
     running.into_iter().try_for_each(|program| program.guard.kill())?;
     Ok(loads)
@@ -146,8 +158,7 @@ impl Look {
 fn counters(stage: &Stage, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {
-        let mut statuses =
-            consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(Duration::from_secs(3));
+        let mut statuses = consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(PATIENCE);
         let status = statuses.next()?.ok_or("no status")?;
         sum.0 += status.counters[Counter::Wakeups];
         sum.1 += status.counters[Counter::Telegrams];

@@ -56,11 +56,15 @@ impl Comparison {
         ];
         kinds.extend(options.beside.iter().map(|path| (path.clone(), Kind::Hub(path.clone()))));
         let count = kinds.len();
-        let candidates = kinds
-            .into_iter()
-            .enumerate()
-            .map(|(number, (name, kind))| Ok(Candidate { name, kind, stage: Stage::numbered(number)? }))
-            .collect::<Outcome<Vec<_>>>()?;
+        let create = |(number, (name, kind))| -> Outcome<Candidate> {
+            let stage = Stage::numbered(number)?;
+            let kind = match kind {
+                Kind::Hub(path) => Kind::Hub(copied(&path, &stage)?),
+                baseline @ Kind::Baseline(_) => baseline,
+            };
+            Ok(Candidate { name, kind, stage })
+        };
+        let candidates = kinds.into_iter().enumerate().map(create).collect::<Outcome<Vec<_>>>()?;
         let lines = (count..2 * count)
             .map(|number| {
                 let stage = Stage::numbered(number)?;
@@ -123,6 +127,14 @@ impl Candidate {
         }
         Ok(subscribers)
     }
+}
+
+/// Copies the program at `path` into the directory of `stage`, and returns the path of the copy. The simulators run
+/// from the program of this build. If a hub ran from the same file, they would keep its code in the processor's caches.
+fn copied(path: &str, stage: &Stage) -> Outcome<String> {
+    let copy = stage.file("scanhub");
+    std::fs::copy(path, &copy).map_err(|error| format!("{path}: {error}"))?;
+    Ok(copy.display().to_string())
 }
 
 /// Name of the baseline in tables.
