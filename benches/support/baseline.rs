@@ -25,8 +25,8 @@ use super::stage::Guard;
 use super::{Outcome, PART, clock, truth};
 
 /// Reads `count` telegrams (0: forever) from each of `ports` in a separate thread, and wakes one process per port. It
-/// wakes up `lead` nanoseconds before the expected end of a telegram. The first line says that it is up; at the end it
-/// prints the hash of each telegram and when it was read.
+/// wakes up `lead` nanoseconds before the expected end of a telegram, or, with 0, as long before it as the hub does. The
+/// first line says that it is up; at the end it prints the hash of each telegram and when it was read.
 pub(crate) fn chain(ports: &[&str], count: usize, lead: u64) -> Outcome<()> {
     let mut sleepers = Vec::new();
     let mut ends = Vec::new();
@@ -92,22 +92,26 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
     let words = |error: Box<dyn std::error::Error>| error.to_string();
     line.await_pause(PAUSE).map_err(words)?;
     let mut kept = Vec::with_capacity(count);
-    let mut duration = TelegramDuration { shortest: 2 * lead, ..TelegramDuration::default() };
+    let mut own_lead = lms::Lead::default();
+    let mut duration = TelegramDuration::default();
     let mut telegram = [0; LENGTH];
     while count == 0 || kept.len() < count {
         let mut filled = 0;
         let mut first = 0;
+        let mut reads_near_end = 0;
         while filled < LENGTH {
             clock::readable(line, None).map_err(|error| error.to_string())?;
             let len = line.read(&mut telegram[filled..]).map_err(words)?;
             let fresh = filled == 0 && len > 0;
             filled += len;
+            reads_near_end += u32::from(reads_near_end > 0 && len > 0);
             if fresh {
                 first = clock::now();
                 if let Some(duration) = duration.known.filter(|_| filled < LENGTH) {
-                    clock::rest(first + duration - lead);
+                    clock::rest(first + duration - if lead > 0 { lead } else { own_lead.nanos() });
                     // As in the hub: bytes have certainly arrived, so there is no need to poll.
                     filled += line.read(&mut telegram[filled..]).map_err(words)?;
+                    reads_near_end = 1;
                 }
             }
         }
@@ -119,6 +123,9 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
         }
         rustix::io::write(&wake, &1u64.to_ne_bytes()).map_err(|error| error.to_string())?;
         duration.learn(last - first);
+        if reads_near_end > 0 {
+            own_lead.adapt(reads_near_end);
+        }
         if count > 0 {
             kept.push((telegram, last));
         }
@@ -129,8 +136,6 @@ fn read(line: &Line, wake: impl AsFd, count: usize, lead: u64) -> Result<Vec<([u
 /// Duration of a telegram, estimated like in the hub: the minimum of several.
 #[derive(Default)]
 struct TelegramDuration {
-    /// Longest duration, in ns, that is too short for a sleep.
-    shortest: u64,
     known: Option<u64>,
     minimum: Option<u64>,
     counted: u32,
@@ -142,8 +147,7 @@ impl TelegramDuration {
         self.counted += 1;
         if self.counted >= if self.known.is_none() { 3 } else { 16 } {
             *self = TelegramDuration {
-                known: self.minimum.filter(|&minimum| minimum > self.shortest),
-                shortest: self.shortest,
+                known: self.minimum.filter(|&minimum| minimum > 2 * LEAD),
                 ..TelegramDuration::default()
             };
         }
@@ -154,8 +158,8 @@ impl TelegramDuration {
 const RATE: u32 = 500_000;
 /// Length of a telegram of 361 beams, in bytes.
 const LENGTH: usize = 732;
-/// Time before the expected end of a telegram at which the baseline wakes up, in ns. It stays as it is when the hub's
-/// own, `lms::LEAD`, changes, so that ratios can be compared with earlier ones.
+/// Time before the expected end of a telegram at which the baseline wakes up, in ns. The hub learns its
+/// own; this one stays as it is, so that ratios can be compared with earlier ones.
 pub(crate) const LEAD: u64 = 600_000;
 /// Longer than the 3.2 ms within a telegram and shorter than the 8.8 ms after it, in ns.
 const PAUSE: u64 = 6_000_000;

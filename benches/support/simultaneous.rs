@@ -6,8 +6,6 @@
 use std::process::Stdio;
 use std::time::Duration;
 
-use scanhub_drivers::lms;
-
 use super::stage::{ALL_AROUND, Child, PATIENCE, PROGRAM, Stage};
 use super::{Options, Outcome, baseline};
 
@@ -32,7 +30,7 @@ pub(crate) struct Candidate {
 pub(crate) enum Kind {
     /// The hub of the program at this path.
     Hub(String),
-    /// The baseline that wakes up this long before the end of a telegram, in ns.
+    /// The baseline that wakes up this long before the end of a telegram, in ns; 0: as long as the hub.
     Baseline(u64),
 }
 
@@ -48,11 +46,10 @@ impl Comparison {
     /// they stream to any program that reads.
     pub(crate) fn start(options: &Options, sensors: usize) -> Outcome<Comparison> {
         let sensors = ALL_AROUND.get(..sensors).ok_or("too many sensors")?;
-        let own = format!("{BASELINE}, woken as the hub, {} us", lms::LEAD / 1000);
         let mut kinds = vec![
             ("hub".to_owned(), Kind::Hub(PROGRAM.to_owned())),
             (BASELINE.to_owned(), Kind::Baseline(baseline::LEAD)),
-            (own, Kind::Baseline(lms::LEAD)),
+            (format!("{BASELINE}, woken as the hub"), Kind::Baseline(0)),
         ];
         kinds.extend(options.beside.iter().map(|path| (path.clone(), Kind::Hub(path.clone()))));
         let count = kinds.len();

@@ -144,7 +144,7 @@ impl Stage {
     }
 
     /// Starts this program as the baseline that reads `count` telegrams from each port, and wakes up `lead` nanoseconds
-    /// before the expected end of each.
+    /// before the expected end of each; 0: as long before it as the hub does.
     pub(crate) fn bare(&self, sensors: &[&str], count: usize, lead: u64) -> Outcome<Child> {
         let ports: Vec<String> = sensors.iter().map(|sensor| self.port(sensor)).collect();
         let mut words: Vec<&str> = ports.iter().map(String::as_str).collect();

@@ -36,6 +36,7 @@ use crate::lms::telegram::MAX_TELEGRAM;
 use crate::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use crate::settings::{self, Key, Refusal, SettingsRequest, Value, refused};
 
+pub use arrival::Lead;
 pub use dialogue::SILENCE;
 pub use inquiry::Inquiry;
 pub use sensor::{Notice, Sensor, Trouble};

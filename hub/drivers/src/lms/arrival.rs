@@ -139,8 +139,7 @@ pub(crate) struct Rhythm {
     first: Option<Nanos>,
     /// Minimum number of reads per telegram.
     pieces: u8,
-    /// How long before the expected end of a telegram the host reads again.
-    lead: Nanos,
+    lead: Lead,
     /// Reads since the sleep that ended shortly before the end of the telegram. `None` before that sleep.
     reads_near_end: Option<u32>,
 }
@@ -153,7 +152,7 @@ impl Rhythm {
             counted: 0,
             first: None,
             pieces: 1,
-            lead: MAX_LEAD,
+            lead: Lead::default(),
             reads_near_end: None,
         }
     }
@@ -179,7 +178,7 @@ impl Rhythm {
     /// each.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
-        let end = first + duration.checked_sub(self.lead)?;
+        let end = first + duration.checked_sub(self.lead.nanos())?;
         let soon = now + MIN_REST;
         let pieces = Nanos::from(self.pieces);
         let piece = (1..pieces).map(|n| first + n * duration / pieces);
@@ -196,24 +195,15 @@ impl Rhythm {
     /// Handles a complete telegram with the given duration from its first to its last byte.
     pub(crate) fn complete(&mut self, took: Nanos) {
         self.first = None;
-        self.adapt_lead();
+        if let Some(reads) = self.reads_near_end.take() {
+            self.lead.adapt(reads);
+        }
         self.least = self.least.min(took);
         self.counted += 1;
         if self.counted >= if self.duration.is_none() { LESSONS } else { WINDOW } {
             self.duration = Some(self.least);
             self.least = Nanos::MAX;
             self.counted = 0;
-        }
-    }
-
-    /// Adapts the lead to the lateness of sleeps and the chunks of the line. With the right lead, the sleep ends before
-    /// the last chunk of the telegram and after the one before it, so that the host waits once.
-    fn adapt_lead(&mut self) {
-        match self.reads_near_end.take() {
-            // The telegram was complete before the sleep ended.
-            Some(1) => self.lead = (self.lead + LEAD_RISE).min(MAX_LEAD),
-            Some(3..) => self.lead = (self.lead - LEAD_FALL).max(MIN_LEAD),
-            _ => {}
         }
     }
 
@@ -229,6 +219,45 @@ impl Rhythm {
     }
 }
 
+/// How long before the expected end of a telegram the host reads again. It adapts to the lateness of sleeps and to the
+/// chunks of the line: the sleep should end before the last chunk of a telegram and after the one before it, so that the
+/// host waits once.
+#[derive(Clone, Copy, Debug)]
+pub struct Lead(Nanos);
+
+impl Lead {
+    /// One or two chunks of 16 bytes at 500,000 baud.
+    const MAX: Nanos = 600 * MICROS;
+    /// The sleeps of an idle host are late by 50 to 100 us.
+    const MIN: Nanos = 100 * MICROS;
+    /// Increase after a sleep that ended too late.
+    const RISE: Nanos = 80 * MICROS;
+    /// Decrease after a telegram for which the host had to wait twice. It is a fraction of [`RISE`](Self::RISE), so that
+    /// few telegrams are late.
+    const FALL: Nanos = 5 * MICROS;
+
+    /// Returns the lead in ns.
+    pub fn nanos(self) -> Nanos {
+        self.0
+    }
+
+    /// Handles a complete telegram, of which `reads` reads after the sleep returned bytes. After 1 it was complete before
+    /// the sleep ended.
+    pub fn adapt(&mut self, reads: u32) {
+        match reads {
+            1 => self.0 = (self.0 + Lead::RISE).min(Lead::MAX),
+            3.. => self.0 = (self.0 - Lead::FALL).max(Lead::MIN),
+            _ => {}
+        }
+    }
+}
+
+impl Default for Lead {
+    fn default() -> Self {
+        Lead(Lead::MAX)
+    }
+}
+
 /// With more bytes than this after a byte in the same read, its stamp is an estimate. An adapter's chunk has 62.
 const ESTIMATED: usize = 64;
 /// After this time without bytes, longer than any sleep at the highest rate, the host was stopped or starved, or the
@@ -237,16 +266,6 @@ const LATE: Nanos = 50 * MILLIS;
 /// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and
 /// longer than the kernel needs to move bytes from one buffer to the next.
 const CALM: Nanos = 12 * MILLIS;
-/// Maximum time before the expected end at which the host reads again, with which it starts: one or two chunks of 16
-/// bytes.
-const MAX_LEAD: Nanos = 600 * MICROS;
-/// Minimum of the same. The sleeps of an idle host are late by 50 to 100 us.
-const MIN_LEAD: Nanos = 100 * MICROS;
-/// The lead becomes longer by this if a sleep ended too late.
-const LEAD_RISE: Nanos = 80 * MICROS;
-/// The lead becomes shorter by this if the host had to wait twice. It is a fraction of [`LEAD_RISE`], so that few
-/// telegrams are late.
-const LEAD_FALL: Nanos = 5 * MICROS;
 /// Minimum sleep. A shorter one is not worth the system call.
 const MIN_REST: Nanos = 500 * MICROS;
 /// Number of telegrams before the first sleep.
@@ -397,7 +416,7 @@ mod tests {
     fn lead_leaves_one_chunk() {
         for (chunk, lateness) in [(320, 60), (320, 150), (1_240, 60), (1_240, 400), (80, 30)] {
             let (reads, late) = play(chunk * MICROS, lateness * MICROS);
-            assert!(reads < 2.2 || chunk < MIN_LEAD / MICROS, "{chunk} us, {lateness} us: {reads} reads");
+            assert!(reads < 2.2 || chunk < Lead::MIN / MICROS, "{chunk} us, {lateness} us: {reads} reads");
             assert!(late <= 20, "{chunk} us, {lateness} us: {late} of 200 late");
         }
         // Sleeps that are late by more than a chunk leave two chunks, or are too late.
