@@ -1,36 +1,33 @@
-//! The command line: the verbs and their arguments. Syntax only; the code that uses a value checks what it means.
+//! The command line: the table of the verbs, and the options that all of them have.
 
 mod bridge;
-mod complete;
 mod config;
 mod convert;
-mod examples;
 mod gateway;
 mod generated;
-pub(crate) mod replay;
-pub(crate) mod simulate;
+pub(crate) mod run;
+mod simulate;
+
+#[cfg(test)]
+#[path = "../tests/it/pages/blocks.rs"]
+mod blocks;
+#[cfg(test)]
+#[path = "../tests/it/pages/shell.rs"]
+mod shell;
 
 use std::path::PathBuf;
-use std::time::Duration;
 
-use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use scanhub_config::Sources;
-use scanhub_network::{KeyArgs, ListenArgs, VerbOptions};
-use scanhub_perception::verbs::{SiteArgs, TiltArgs, TrackArgs};
+use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+use scanhub_network as network;
+use scanhub_perception::verbs as perception;
 use scanhub_schema::{Failure, Family};
-use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
-use scanhub_verbs::{BackgroundArgs, ControlArgs, EchoArgs, HzArgs, InfoArgs, ListArgs, ZonesArgs, duration};
+use scanhub_shm::DEFAULT_DOMAIN;
+use scanhub_tools::{configure, probe, telegram};
+use scanhub_verbs::context::Context;
+use scanhub_verbs::{background, control, echo, hz, info, latency, leds, list, record, zones};
+use scanhub_viewer as viewer;
 
-use crate::demo::{Families, World};
-
-pub(crate) use self::config::Config;
-pub(crate) use bridge::Bridge;
-pub(crate) use complete::Complete;
-pub(crate) use convert::Convert;
-pub(crate) use gateway::Gateway;
-pub(crate) use generated::{Completions, Man};
-pub(crate) use replay::Replay;
+use crate::{demo, replay};
 
 /// Share laser scanners (SICK LMS 2xx, LDROBOT, RPLIDAR) between programs. One hub reads the ports; any number of programs get
 /// the scans.
@@ -40,26 +37,21 @@ pub(crate) struct Cli {
     #[command(subcommand)]
     pub(crate) verb: Verb,
     #[command(flatten)]
-    pub(crate) everywhere: Everywhere,
-}
-
-/// The whole definition.
-pub(crate) fn command() -> Command {
-    examples::with_examples(Cli::command())
+    pub(crate) global: GlobalOptions,
 }
 
 impl Cli {
     /// The command line of this process.
     pub(crate) fn of_process() -> Result<Cli, clap::Error> {
-        let mut command = command();
+        let mut command = Cli::command();
         let matches = command.try_get_matches_from_mut(std::env::args_os())?;
         Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
     }
 }
 
-/// What every verb takes.
+/// Options of all verbs.
 #[derive(Args, Clone, Debug)]
-pub(crate) struct Everywhere {
+pub(crate) struct GlobalOptions {
     /// Name of the hub, if several run on this machine: 1 to 16 of a-z, 0-9 and -
     #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     pub(crate) domain: String,
@@ -71,179 +63,153 @@ pub(crate) struct Everywhere {
     pub(crate) json: bool,
 }
 
-impl Everywhere {
-    /// The domain as a hub opens it.
-    pub(crate) fn hub_domain(&self) -> Result<Domain, Failure> {
-        Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())
-    }
+/// Makes an enum of all verbs from the table below. A verb is run by its function `run`, which takes the whole [`Context`], or by
+/// the expression after the arrow.
+macro_rules! verbs {
+    ($($verb:ident($args:ty) $(=> |$name:ident, $context:ident| $run:expr)?,)*) => {
+        /// A verb with its arguments.
+        #[derive(Debug, Subcommand)]
+        pub(crate) enum Verb {
+            $($verb($args),)*
+        }
 
-    /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
-    pub(crate) fn publisher_domain(&self) -> Result<Domain, Failure> {
-        scanhub_shm::publisher_domain(&self.domain, self.root.as_deref(), &Environment::of_process())
-    }
-
-    /// Returns the options for a verb that reads them itself.
-    pub(crate) fn verb(&self) -> VerbOptions<'_> {
-        VerbOptions { domain: &self.domain, root: self.root.as_deref(), json: self.json }
-    }
-
-    /// The places in which a client looks for it.
-    pub(crate) fn places(&self) -> Result<Vec<Domain>, Failure> {
-        Domain::candidates(&self.domain, self.root.as_deref(), &Environment::of_process())
-    }
+        impl Verb {
+            /// Runs the verb.
+            pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
+                match self {
+                    $(Verb::$verb(args) => verbs!(@run args, context $(, $name, $context, $run)?),)*
+                }
+            }
+        }
+    };
+    (@run $args:ident, $process:ident) => {
+        $args.run($process)
+    };
+    (@run $args:ident, $process:ident, $name:ident, $context:ident, $run:expr) => {{
+        let ($name, $context) = ($args, $process);
+        $run
+    }};
 }
 
-#[derive(Debug, Subcommand)]
-pub(crate) enum Verb {
-    /// Run the hub in the foreground, until SIGINT or SIGTERM
-    Run(Run),
-    /// Run a hub that plays a recording instead of sensors, with the keys of a player
-    #[command(after_help = replay::KEYS)]
-    Replay(Replay),
-    /// Run simulated sensors, the hub and a consumer for each in one terminal
-    Demo(Demo),
-    /// Simulate sensors at the other end of ptys, or behind TCP
-    #[command(after_help = simulate::fault_table())]
+// The order is that of the help. The crate of the tools does not depend on the crate of `Context`.
+verbs! {
+    Run(run::Run),
+    Replay(replay::Replay),
+    Demo(demo::Demo),
     Simulate(Box<simulate::Simulate>),
-    /// Show the sensor at a port; without a port, list the ports
-    Probe(scanhub_tools::probe::ProbeArgs),
-    /// Change a sensor's EEPROM settings: shows the difference and asks first
-    #[command(after_help = scanhub_tools::configure::CONSENT)]
-    Configure(scanhub_tools::configure::ConfigureArgs),
-    /// Print a default configuration, check one, or show the values in effect and their origin
-    Config(Config),
-    /// Check the setup and show how to fix what is wrong
-    Doctor {
-        #[command(flatten)]
-        args: scanhub_tools::doctor::DoctorArgs,
-        #[command(flatten)]
-        run: Run,
-    },
-    /// List the sensors and topics of the running hub
-    List(ListArgs),
-    /// Show state, settings and counters of sensors
-    Info(InfoArgs),
-    /// Print samples as they arrive
-    Echo(EchoArgs),
-    /// Measure rate, jitter and loss of topics
-    Hz(HzArgs),
-    /// Measure how old samples are on arrival, split into line, hub and wake-up: percentiles
-    Latency(scanhub_verbs::LatencyArgs),
-    /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
-    Watch(scanhub_viewer::WatchArgs),
-    /// Serve the live picture to browsers, and to Foxglove and Lichtblick
-    Web(scanhub_viewer::WebArgs),
-    /// Record what the hub publishes in MCAP files
-    Record(scanhub_verbs::RecordArgs),
-    /// Explain telegrams field by field, or write them
-    Telegram(scanhub_tools::telegram::TelegramArgs),
-    /// Pause a sensor, resume it, or restart its session
-    Control(ControlArgs),
-    /// Show, reset, freeze, save or load the background model of a sensor
-    Background(BackgroundArgs),
-    /// Learn which part of a sensor's view is the robot itself
-    Zones(ZonesArgs),
-    /// Follow people across the sensors and rooms of a site, and count them at doors
-    Track(TrackArgs),
-    /// 3D from a tilting scanner: points, background, obstacles
-    Tilt(TiltArgs),
-    /// Check and draw the plan of sensors, rooms and doors that people are followed in
-    Site(SiteArgs),
-    /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
-    Leds(scanhub_verbs::LedsArgs),
-    /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
-    #[command(after_help = scanhub_network::groups_help())]
-    Gateway(Gateway),
-    /// Receive what gateways of other machines send, and show what was lost
-    #[command(after_help = scanhub_network::LISTEN_SIGNALS)]
-    Listen(ListenArgs),
-    /// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
-    Bridge(Bridge),
-    /// Make the key that gateways and listeners share
-    Key(KeyArgs),
-    /// Convert a recording to another format, or repair a damaged one
-    #[command(after_help = convert::REPAIR)]
-    Convert(Convert),
-    /// Print the completion script for a shell
-    Completions(Completions),
-    /// Print names of the running hub for the completion scripts
-    #[command(hide = true)]
-    Complete(Complete),
-    /// Print or write the manual pages
-    Man(Man),
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Run {
-    #[command(flatten)]
-    pub(crate) configured: Configured,
-    /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max], and keys of the link may follow
-    /// it, as in front=/dev/ttyUSB0,family=ld
-    #[arg(long, value_name = "NAME=PORT[,KEY=VALUE]")]
-    pub(crate) link: Vec<String>,
-}
-
-impl Run {
-    /// Where the configuration is read from.
-    pub(crate) fn sources(&self) -> Sources {
-        Sources { links: self.link.clone(), ..self.configured.sources() }
-    }
-}
-
-/// Where a configuration is read from, apart from links.
-#[derive(Args, Debug, Default)]
-pub(crate) struct Configured {
-    /// Read this TOML file after those in /etc/scanhub
-    #[arg(long, env = "SCANHUB_CONFIG", value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Do not read /etc/scanhub
-    #[arg(long)]
-    no_system_config: bool,
-    /// Set one value, for example link.front.angle=100
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
-}
-
-impl Configured {
-    pub(crate) fn sources(&self) -> Sources {
-        let mut files = if self.no_system_config { Vec::new() } else { Sources::system() };
-        files.extend(self.config.clone());
-        Sources { files, set: self.set.clone(), links: Vec::new() }
-    }
-}
-
-#[derive(Args, Debug)]
-pub(crate) struct Demo {
-    /// Run without the live view: print a summary line per sensor at the end; exit 5 if a telegram was lost
-    #[arg(long)]
-    pub(crate) headless: bool,
-    /// Stop after this time, for example 10s [default: at Ctrl-C]
-    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
-    pub(crate) run_for: Option<Duration>,
-    /// demo: two sensors on a robot. house: four sensors in two rooms, and people who are followed from room to room. tilt: a
-    /// tilting scanner that finds obstacles in 3D
-    #[arg(long, default_value = "demo", value_name = "WORLD", value_parser = worlds())]
-    pub(crate) world: World,
-    /// Seed of rooms and people
-    #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
-    /// Of which family the sensors are; mixed: one of each family
-    #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
-    pub(crate) family: Families,
-}
-
-fn worlds() -> impl TypedValueParser<Value = World> {
-    PossibleValuesParser::new(World::NAMES)
-        .map(|name| World::parse(&name).expect("one of the possible names"))
-}
-
-fn families() -> impl TypedValueParser<Value = Families> {
-    PossibleValuesParser::new(Families::names())
-        .map(|name| Families::parse(&name).expect("one of the possible names"))
+    Probe(probe::ProbeArgs) => |probe, it|
+        probe.run(it.json, || it.domain.places(), &mut it.out, &*it.signals.stop()?),
+    Configure(configure::ConfigureArgs) => |configure, it|
+        configure.run(it.json, &it.domain.places()?, &mut it.out, &*it.signals.any_end()?),
+    Config(config::Config),
+    Doctor(run::Doctor),
+    List(list::ListArgs),
+    Info(info::InfoArgs),
+    Echo(echo::EchoArgs),
+    Hz(hz::HzArgs),
+    Latency(latency::LatencyArgs),
+    Watch(viewer::WatchArgs),
+    Web(viewer::WebArgs) => |web, it| replay::page::run(web, it),
+    Record(record::RecordArgs),
+    Telegram(telegram::TelegramArgs) => |telegram, it| telegram.run(it.json, &mut it.out),
+    Control(control::ControlArgs),
+    Background(background::BackgroundArgs),
+    Zones(zones::ZonesArgs),
+    Track(perception::TrackArgs),
+    Tilt(perception::TiltArgs),
+    Site(perception::SiteArgs),
+    Leds(leds::LedsArgs),
+    Gateway(gateway::Gateway),
+    Listen(network::ListenArgs),
+    Bridge(bridge::Bridge),
+    Key(network::KeyArgs),
+    Convert(convert::Convert),
+    Completions(generated::Completions),
+    Complete(generated::Complete),
+    Man(generated::Man),
 }
 
 /// Parses the name of a family.
-fn family(text: &str) -> Result<Family, String> {
+pub(crate) fn family(text: &str) -> Result<Family, String> {
     let names = || Family::ALL.map(Family::name).join(", ");
     Family::parse(&text.to_lowercase()).ok_or_else(|| format!("one of {}, not {text:?}", names()))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::{ArgMatches, Command};
+
+    use super::*;
+
+    /// Returns how this program parses its first command line in `line`.
+    fn read(line: &str) -> ArgMatches {
+        let words = shell::of_the_program(line);
+        let first = words.first().unwrap_or_else(|| panic!("nothing for this program: {line}"));
+        let read = Cli::command().try_get_matches_from(first);
+        read.unwrap_or_else(|error| panic!("{line}: {error}"))
+    }
+
+    /// Returns the examples in the help of all verbs below `command`, each with the path to its verb.
+    fn examples(command: &Command, before: &str) -> Vec<(String, String)> {
+        let mut examples = Vec::new();
+        // A hidden verb needs no example.
+        for verb in command.get_subcommands().filter(|verb| !verb.is_hide_set()) {
+            let path = format!("{before}{}", verb.get_name());
+            let help = verb.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let title = help.lines().next().unwrap_or_default();
+            let lines = help.lines().skip(1).map_while(|line| line.strip_prefix("  "));
+            let own: Vec<_> = lines.map(|line| (path.clone(), line.to_owned())).collect();
+            let expected = match own.len() {
+                0 => panic!("{path} has no example: {help:?}"),
+                1 => "Example:",
+                _ => "Examples:",
+            };
+            assert_eq!(title, expected, "{path}: {help}");
+            examples.extend(own);
+            examples.extend(self::examples(verb, &format!("{path} ")));
+        }
+        examples
+    }
+
+    #[test]
+    fn every_verb_has_an_example_that_can_be_read() {
+        let command = Cli::command();
+        for (path, line) in examples(&command, "") {
+            let read = read(&line);
+            let mut matches = &read;
+            for verb in path.split(' ') {
+                let (name, deeper) = matches.subcommand().unwrap_or_else(|| panic!("{line}: no {verb}"));
+                assert_eq!(name, verb, "{line}");
+                matches = deeper;
+            }
+        }
+        command.debug_assert();
+    }
+
+    #[test]
+    fn every_example_runs_in_zsh_unchanged() {
+        let of_help = examples(&Cli::command(), "").into_iter().map(|(_, line)| line);
+        let of_pages = blocks::blocks().into_iter().filter(|block| block.language == "sh");
+        let of_pages = of_pages.flat_map(|block| shell::lines(&block.text));
+        for line in of_help.chain(of_pages) {
+            assert_eq!(shell::patterns(&line), Vec::<String>::new(), "{line}");
+        }
+    }
+
+    #[test]
+    fn every_command_line_on_a_page_can_be_read() {
+        let mut count = 0;
+        for block in blocks::blocks().into_iter().filter(|block| block.language == "sh") {
+            for line in shell::lines(&block.text) {
+                for words in shell::of_the_program(&line) {
+                    let read = Cli::command().try_get_matches_from(&words);
+                    read.unwrap_or_else(|error| panic!("{}: {line}: {error}", block.place));
+                    count += 1;
+                }
+            }
+        }
+        assert!(count > 40, "{count}");
+        let unknown = Cli::command().try_get_matches_from(["scanhub", "record", "--ros3"]);
+        assert!(unknown.is_err(), "what is wrong would be found");
+    }
 }

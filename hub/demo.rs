@@ -14,80 +14,111 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Kind};
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use scanhub_schema::{Failure, Family, Kind};
 use scanhub_shm::Domain;
+use scanhub_verbs::context::Context;
+use scanhub_verbs::duration;
 use scanhub_viewer::{WatchArgs, can_show_pictures};
 use serde::Serialize;
 use serde_json::Value;
 
 use account::Account;
-pub(crate) use cast::{Families, World};
+use cast::{Families, World};
 use stage::{Line, Stage};
 use view::View;
 
-/// Options of a demonstration.
-#[derive(Clone, Debug)]
-pub(crate) struct DemoOptions {
-    /// Whether there is no live view.
-    pub(crate) headless: bool,
-    /// Duration from the first sample on. `None`: until the user stops it.
-    pub(crate) run_for: Option<Duration>,
-    /// The simulated world.
-    pub(crate) world: World,
-    /// Seed of the rooms.
-    pub(crate) seed: u64,
-    /// Families of the sensors.
-    pub(crate) family: Families,
-    /// Whether the summary is JSON.
-    pub(crate) json: bool,
+/// Run simulated sensors, the hub and a consumer for each in one terminal
+#[derive(Args, Debug)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct Demo {
+    /// Run without the live view: print a summary line per sensor at the end; exit 5 if a telegram was lost
+    #[arg(long)]
+    headless: bool,
+    /// Stop after this time, for example 10s [default: at Ctrl-C]
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// demo: two sensors on a robot. house: four sensors in two rooms, and people who are followed from room to room. tilt: a
+    /// tilting scanner that finds obstacles in 3D
+    #[arg(long, default_value = "demo", value_name = "WORLD", value_parser = worlds())]
+    world: World,
+    /// Seed of rooms and people
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Of which family the sensors are; mixed: one of each family
+    #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
+    family: Families,
 }
 
-/// Runs until `run_for` has elapsed, the picture is closed, or `stop` is set. Then prints a summary for each sensor.
-///
-/// # Errors
-///
-/// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
-/// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
-pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
-    let shows = !options.headless && !options.json;
-    let has_picture = shows && can_show_pictures();
-    let sensors = options.world.sensors(options.family)?;
-    let stage = Stage::new(has_picture, options.world, sensors)?;
-    // If no port is free, the demonstration runs without the page.
-    let web = if shows { stage.start_web().ok() } else { None };
-    let url = web.as_ref().map(|(_, url)| url.as_str());
-    let played = if has_picture {
-        play_with_picture(options, &stage, url, out, stop)
-    } else {
-        let (mut view, mut is_said) = (View::new(attach(&stage), url), false);
-        let mut show = |account: &Account, elapsed: Duration| {
-            if shows {
-                view.draw(out, account, elapsed);
-            } else if !std::mem::replace(&mut is_said, true) {
-                say_ready(out, &stage, options.json);
-            }
+const EXAMPLES: &str = "\
+Examples:
+  scanhub demo
+  scanhub demo --world house
+  scanhub demo --family mixed
+  scanhub demo --headless --for 10s";
+
+impl Demo {
+    /// Runs until the configured time has elapsed, the picture is closed, or a signal arrives. Then prints a summary for each sensor.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
+    /// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        // Without a picture, the demonstration may outlive its terminal.
+        let stop = if self.headless { context.signals.stop()? } else { context.signals.any_end()? };
+        let json = context.json;
+        let shows = !self.headless && !json;
+        let has_picture = shows && can_show_pictures();
+        let sensors = self.world.sensors(self.family)?;
+        let stage = Stage::new(has_picture, self.world, sensors)?;
+        // If no port is free, the demonstration runs without the page.
+        let web = if shows { stage.start_web().ok() } else { None };
+        let url = web.as_ref().map(|(_, url)| url.as_str());
+        let played = if has_picture {
+            play_with_picture(self, &stage, url, &mut context.out, &stop)
+        } else {
+            let (mut view, mut is_said) = (View::new(attach(&stage), url), false);
+            let mut show = |account: &Account, elapsed: Duration| {
+                if shows {
+                    view.draw(&mut context.out, account, elapsed);
+                } else if !std::mem::replace(&mut is_said, true) {
+                    say_ready(&mut context.out, &stage, json);
+                }
+            };
+            play(self, &stage, &mut show, &|| stop.swap(false, Ordering::Relaxed))
         };
-        play(options, &stage, &mut show, &|| stop.swap(false, Ordering::Relaxed))
-    };
-    drop(web);
-    stage.print_errors();
-    let (account, end) = played?;
-    account.summary(out, options.json);
-    if end == End::Hurried {
-        return Err(Failure::new(Kind::Interrupted, "interrupted before all telegrams had arrived", ""));
+        drop(web);
+        stage.print_errors();
+        let (account, end) = played?;
+        account.summary(&mut context.out, json);
+        if end == End::Hurried {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before all telegrams had arrived", ""));
+        }
+        if let Some(loss) = account.loss() {
+            return Err(Failure::new(Kind::Check, loss, "is the machine too busy to run all processes?"));
+        }
+        if end == End::Stopped && self.run_for.is_some() {
+            return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
+        }
+        Ok(())
     }
-    if let Some(loss) = account.loss() {
-        return Err(Failure::new(Kind::Check, loss, "is the machine too busy to run all processes?"));
-    }
-    if end == End::Stopped && options.run_for.is_some() {
-        return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
-    }
-    Ok(())
+}
+
+fn worlds() -> impl TypedValueParser<Value = World> {
+    PossibleValuesParser::new(World::NAMES)
+        .map(|name| World::parse(&name).expect("one of the possible names"))
+}
+
+fn families() -> impl TypedValueParser<Value = Families> {
+    PossibleValuesParser::new(Families::names())
+        .map(|name| Families::parse(&name).expect("one of the possible names"))
 }
 
 /// Does the same as [`play`] while the terminal shows the picture. Closing the picture ends the demonstration.
 fn play_with_picture(
-    options: &DemoOptions,
+    options: &Demo,
     stage: &Stage,
     url: Option<&str>,
     out: &mut dyn Write,
@@ -164,7 +195,7 @@ enum End {
 /// user stops the demonstration. `is_asked` returns whether the user has requested the end since the last call.
 /// Telegrams on their way still arrive after that, unless there is another request.
 fn play(
-    options: &DemoOptions,
+    options: &Demo,
     stage: &Stage,
     show: &mut dyn FnMut(&Account, Duration),
     is_asked: &dyn Fn() -> bool,

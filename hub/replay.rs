@@ -7,51 +7,110 @@ pub(crate) mod page;
 use std::io::{IsTerminal, Read, stderr, stdin};
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
+use clap::Args;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::getpgrp;
 use rustix::termios::{
     LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcgetpgrp, tcsetattr,
 };
-use scanhub_daemon::{Player, Progress};
-use scanhub_schema::Failure;
+use scanhub_daemon::{PlaybackOptions, PlaybackRate, Player, Progress};
+use scanhub_schema::{Failure, Family, Kind};
+use scanhub_verbs::context::Context;
+use scanhub_verbs::duration;
 use serde::Serialize;
 
-use crate::cli::{Everywhere, Replay};
-
+use crate::cli;
+use crate::cli::run::{self, Configured};
 use crate::mounts::RecordedMounts;
 use line::Line;
 
-/// Runs until the recording has been played or the user ends it. Then prints a summary.
-pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Failure> {
-    let domain = everywhere.hub_domain()?;
-    let options = scanhub_daemon::Replay {
-        file: &replay.file,
-        sensor: replay.sensor.as_deref(),
-        family: replay.family,
-        sources: &replay.configured.sources(),
-        play: replay.play()?,
-        holds: replay.hold,
-    };
-    let mut console = None;
-    let mut mounts = None;
-    let played = scanhub_daemon::replay(&options, &domain, |ready, player| {
-        let started = mounts.insert(RecordedMounts::start(player, &domain));
-        if started.is_err() {
-            return player.end();
+/// Run a hub that plays a recording instead of sensors, with the keys of a player
+#[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
+pub(crate) struct Replay {
+    /// Recording to play: MCAP file, telegram stream or CARMEN log, plain or gzipped
+    file: PathBuf,
+    /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
+    #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = pace)]
+    rate: PlaybackRate,
+    /// Start again at the end, until Ctrl-C; each lap forgets what was learned
+    #[arg(long = "loop", conflicts_with = "hold")]
+    is_looped: bool,
+    /// Start publishing here, for example 90s; the part before it is only learned from
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    start: Option<Duration>,
+    /// Stop publishing here
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    end: Option<Duration>,
+    /// Wait before the first telegram, until a key or `scanhub control SENSOR resume`
+    #[arg(long)]
+    paused: bool,
+    /// Stay at the end, without publishing, until Ctrl-C
+    #[arg(long)]
+    hold: bool,
+    /// Play only this sensor, and no mounts; for a stream or a log, the name that it gets [default: front]
+    #[arg(long, value_name = "NAME")]
+    sensor: Option<String>,
+    /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]
+    #[arg(long, value_name = "NAME", value_parser = cli::family)]
+    family: Option<Family>,
+    #[command(flatten)]
+    configured: Configured,
+}
+
+impl Replay {
+    /// Runs until the recording has been played or the user ends it. Then prints a summary.
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let domain = context.domain.of_hub()?;
+        let options = scanhub_daemon::Replay {
+            file: &self.file,
+            sensor: self.sensor.as_deref(),
+            family: self.family,
+            sources: &self.configured.sources(),
+            play: self.play()?,
+            holds: self.hold,
+        };
+        let mut console = None;
+        let mut mounts = None;
+        let played = scanhub_daemon::replay(&options, &domain, |ready, player| {
+            let started = mounts.insert(RecordedMounts::start(player, &domain));
+            if started.is_err() {
+                return player.end();
+            }
+            run::say_ready(ready, &domain, context.json);
+            if !context.json {
+                console = Console::open(player);
+            }
+        });
+        drop(console);
+        let played = played?;
+        mounts.transpose()?;
+        crate::say(&if context.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) });
+        Ok(())
+    }
+
+    /// The options of the player.
+    ///
+    /// [`Kind::Usage`] if it ends before it starts.
+    fn play(&self) -> Result<PlaybackOptions, Failure> {
+        let start = self.start.unwrap_or_default();
+        if let Some(end) = self.end.filter(|end| *end <= start) {
+            let message = format!("--end {end:?} is not after --start {start:?}");
+            return Err(Failure::new(Kind::Usage, message, "both count from the first telegram"));
         }
-        crate::say_ready(ready, &domain, everywhere.json);
-        if !everywhere.json {
-            console = Console::open(player);
-        }
-    });
-    drop(console);
-    let played = played?;
-    mounts.transpose()?;
-    crate::say(&if everywhere.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) });
-    Ok(())
+        Ok(PlaybackOptions {
+            rate: self.rate,
+            start_ns: nanos(start),
+            end_ns: self.end.map(nanos),
+            is_looped: self.is_looped,
+            is_paused: self.paused,
+        })
+    }
 }
 
 /// The thread that handles keys and draws the progress line. Dropping it ends the thread.
@@ -175,6 +234,21 @@ impl Drop for Keys {
     }
 }
 
+fn nanos(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}
+
+fn pace(text: &str) -> Result<PlaybackRate, String> {
+    if text == "max" {
+        return Ok(PlaybackRate::Max);
+    }
+    let rate =
+        text.parse().ok().filter(|rate| (PlaybackRate::SLOWEST..=PlaybackRate::FASTEST).contains(rate));
+    rate.map(PlaybackRate::Times).ok_or_else(|| {
+        format!("a number from {} to {}, or max", PlaybackRate::SLOWEST, PlaybackRate::FASTEST)
+    })
+}
+
 /// Class `replayed`.
 #[derive(Serialize)]
 struct Replayed {
@@ -199,3 +273,29 @@ const REDRAW_NS: u64 = 200_000_000;
 const REDRAW: Timespec = Timespec { tv_sec: 0, tv_nsec: REDRAW_NS as i64 };
 /// Value of a special character that no key produces (`_POSIX_VDISABLE`).
 const DISABLED: u8 = 0;
+
+/// The keys, for the end of the help.
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub replay walk.mcap
+  scanhub replay walk.mcap --rate max --set 'zones.radii=[1.2,0.7]'
+  scanhub replay walk.mcap --start 1m --end 90s --loop --paused
+
+Keys:
+  space         pause, and continue
+  . or right    play one telegram, of the sensor that has the next one, and pause
+  + and -       twice as fast, half as fast
+  q             quit";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates() {
+        assert_eq!((pace("max"), pace("0.5")), (Ok(PlaybackRate::Max), Ok(PlaybackRate::Times(0.5))));
+        for wrong in ["0", "-1", "65", "nan", "inf", "fast", ""] {
+            assert!(pace(wrong).is_err_and(|error| error.contains("0.015625 to 64, or max")), "{wrong}");
+        }
+    }
+}

@@ -1,7 +1,6 @@
 //! `scanhub bridge` on the command line: another program, which knows its own arguments. It is one of its own because few
 //! need it, and what it is built of is five times as much as all the rest.
 
-use std::convert::Infallible;
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
@@ -9,32 +8,39 @@ use std::process::Command;
 use clap::Args;
 use scanhub_schema::{Failure, Kind};
 use scanhub_tools::bridge_program::{PROGRAM, find, places};
+use scanhub_verbs::context::Context;
 
-use super::Everywhere;
-
+/// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
 #[derive(Args, Debug)]
 #[command(disable_help_flag = true)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Bridge {
     /// Arguments of scanhub-bridge, among them --help
     #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGS")]
     arguments: Vec<OsString>,
 }
 
+const EXAMPLES: &str = "\
+Examples:
+  scanhub bridge --listen tcp/0.0.0.0:7447
+  scanhub bridge --connect tcp/robot:7447 --publish --name robot1=5f3a12bc00d1e2f3
+  scanhub bridge --help";
+
 impl Bridge {
     /// Becomes the program: the one beside this one, else the one that is found by its name.
     ///
     /// [`Kind::Configuration`] if there is none, or if it is of another version.
-    pub(crate) fn run(&self, everywhere: &Everywhere) -> Result<Infallible, Failure> {
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // In one line: what is wrong, and what to do.
         let program = find(&places()).map_err(|Failure { kind, message, hint }| {
             Failure::new(kind, format!("{message}; {hint}"), "")
         })?;
         let mut command = Command::new(&program);
-        command.args(["--domain", &everywhere.domain]);
-        if let Some(root) = &everywhere.root {
+        command.args(["--domain", &context.domain.name]);
+        if let Some(root) = &context.domain.root {
             command.arg("--root").arg(root);
         }
-        if everywhere.json {
+        if context.json {
             command.arg("--json");
         }
         let error = command.args(&self.arguments).exec();

@@ -5,22 +5,34 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use scanhub_config::{DEFAULT, Link, Value, values};
 use scanhub_schema::Failure;
+use scanhub_verbs::context::Context;
 use serde::Serialize;
 
-use super::{Everywhere, Gateway, Run};
+use super::gateway::Gateway;
+use super::run::Run;
 use crate::{line, print};
 
+/// Print a default configuration, check one, or show the values in effect and their origin
 #[derive(Args, Debug)]
+#[command(after_help = EXAMPLES)]
 pub(crate) struct Config {
     #[command(subcommand)]
     order: Order,
 }
 
+const EXAMPLES: &str = "\
+Examples:
+  scanhub config default > scanhub.toml
+  scanhub config check scanhub.toml
+  scanhub config show";
+
 #[derive(Debug, Subcommand)]
 enum Order {
     /// Print a configuration to start from, with all default values
+    #[command(after_help = "Example:\n  scanhub config default > scanhub.toml")]
     Default,
     /// Check the configuration; if it has an error, show the place and exit with 78
+    #[command(after_help = "Example:\n  scanhub config check scanhub.toml")]
     Check {
         /// Check only this file
         file: Option<PathBuf>,
@@ -28,6 +40,7 @@ enum Order {
         run: Run,
     },
     /// Show every value in effect and its origin
+    #[command(after_help = SHOW_EXAMPLES)]
     Show {
         #[command(flatten)]
         run: Run,
@@ -35,7 +48,7 @@ enum Order {
 }
 
 impl Config {
-    pub(crate) fn run(&self, everywhere: &Everywhere) -> Result<(), Failure> {
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let text = match &self.order {
             Order::Default => DEFAULT.trim_end().to_owned(),
             Order::Check { file, run } => {
@@ -44,13 +57,13 @@ impl Config {
                     sources.files = vec![file.clone()];
                 }
                 let sources = sources.read();
-                Gateway::check(&sources, everywhere)?;
+                Gateway::check(&sources, &context.domain)?;
                 let links = scanhub_config::Config::of(&sources)?.links;
-                if everywhere.json { checked_line(&links) } else { checked(&links) }
+                if context.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {
                 let values = values(&run.sources())?;
-                if everywhere.json {
+                if context.json {
                     values.iter().map(line).collect::<Vec<_>>().join("\n")
                 } else {
                     table(&values)
@@ -98,3 +111,8 @@ fn table(values: &[Value]) -> String {
 
 /// A column is not made wider than this for the sake of one row.
 const WIDEST: usize = 48;
+
+const SHOW_EXAMPLES: &str = "\
+Examples:
+  scanhub config show
+  scanhub config show --config robot.toml --set link.front.angle=100";

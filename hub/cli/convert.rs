@@ -2,7 +2,6 @@
 
 use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use scanhub_recording::convert::{self, ConvertOptions, Converted};
@@ -10,11 +9,14 @@ use scanhub_recording::{Damage, Form, Unread};
 use scanhub_schema::file::Compression;
 use scanhub_schema::{Failure, Family};
 use scanhub_sim::options;
+use scanhub_verbs::context::Context;
 use serde::Serialize;
 
 use crate::{complain, line, print};
 
+/// Convert a recording to another format, or repair a damaged one
 #[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
 pub(crate) struct Convert {
     /// Recording to read, damaged or not: MCAP file, telegram stream or CARMEN log, plain or gzipped
     #[arg(value_name = "IN")]
@@ -56,8 +58,9 @@ pub(crate) struct Convert {
 }
 
 impl Convert {
-    /// Converts until `stop` is set.
-    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+    /// Converts until the end of the recording or a signal.
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (json, stop) = (context.json, context.signals.stop()?);
         let options = ConvertOptions {
             input: self.input.clone(),
             output: self.output.clone(),
@@ -78,7 +81,7 @@ impl Convert {
                 let _ = write!(stderr(), "\r{done} of {all} telegrams");
             }
         };
-        let outcome = convert::convert(&options, stop, progress);
+        let outcome = convert::convert(&options, &stop, progress);
         if is_watched {
             let _ = write!(stderr(), "\r\x1b[K");
         }
@@ -201,6 +204,15 @@ fn seconds(ns: u64) -> f64 {
 }
 
 /// How a recording is repaired, for the end of the help.
-pub(crate) const REPAIR: &str = "\
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub convert killed.mcap whole.mcap
+  scanhub convert robot.mcap front.log.gz --sensor front
+  scanhub convert room.log.gz room.mcap
+  scanhub convert walk.mcap ros.mcap --ros2
+  scanhub convert walk.mcap points.mcap --ros2 --points
+  scanhub convert robot.mcap front.csv --sensor front --meters
+  scanhub convert robot.mcap marks.csv --topic front/marks
+
 MCAP to MCAP copies everything and writes a new index: a cut or damaged file becomes a complete file with all
 messages that can be read. Damage is reported but is not a failure: the exit code is 0 if the output is complete.";

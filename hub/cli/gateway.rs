@@ -4,10 +4,12 @@ use clap::Args;
 use scanhub_config::SourceMap;
 use scanhub_network::GatewayArgs;
 use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::context::{Context, DomainOptions};
 use scanhub_verbs::duration;
 
-use super::{Configured, Everywhere};
+use super::run::Configured;
 
+/// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
 #[derive(Args, Debug, Default)]
 pub(crate) struct Gateway {
     #[command(flatten)]
@@ -17,20 +19,20 @@ pub(crate) struct Gateway {
 }
 
 impl Gateway {
-    /// Returns the arguments, with the values of the configuration for those that are missing.
-    pub(crate) fn args(&self) -> Result<GatewayArgs, Failure> {
+    /// Runs the gateway with the values of the configuration for arguments that are missing.
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let args = over(&self.args, &self.configured.sources().read())?;
         if self.args.topics.is_empty() {
             // They come from the configuration.
             args.check().map_err(of_section)?;
         }
-        Ok(args)
+        args.run(context)
     }
 
     /// Checks that a gateway accepts the section in `sources`.
-    pub(super) fn check(sources: &SourceMap, everywhere: &Everywhere) -> Result<(), Failure> {
+    pub(super) fn check(sources: &SourceMap, domain: &DomainOptions) -> Result<(), Failure> {
         let args = over(&GatewayArgs::default(), sources)?;
-        everywhere.places()?;
+        domain.places()?;
         args.check().map_err(of_section)
     }
 }

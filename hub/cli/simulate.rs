@@ -1,16 +1,25 @@
-//! `scanhub simulate` on the command line: what it takes.
+//! `scanhub simulate`: simulates scanners, and the mounts that tilt them.
 
-use std::path::PathBuf;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
 use scanhub_schema::Failure;
 use scanhub_sim::fault::Faults;
 use scanhub_sim::options::{self, SimulateOptions};
+use scanhub_verbs::context::Context;
 use scanhub_verbs::duration;
+use serde::Serialize;
+use signal_hook::consts::{SIGINT, SIGTERM};
 
+use crate::mounts::SimulatedMounts;
+use crate::{line, no_handler, say};
+
+/// Simulate sensors at the other end of ptys, or behind TCP
 #[derive(Args, Debug)]
 #[command(group = clap::ArgGroup::new("place").args(["port", "tcp"]).required(true).multiple(true))]
+#[command(after_help = after_help())]
 pub(crate) struct Simulate {
     /// Where to create each sensor's pty, as a symlink
     #[arg(long, value_name = "PATH")]
@@ -112,7 +121,30 @@ pub(crate) struct Simulate {
 }
 
 impl Simulate {
-    pub(crate) fn options(&self) -> Result<SimulateOptions, Failure> {
+    /// Simulates until SIGINT or SIGTERM.
+    pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let options = self.options()?;
+        let (stop, write) = UnixStream::pair().map_err(no_handler)?;
+        for signal in [SIGINT, SIGTERM] {
+            let write = write.try_clone().map_err(no_handler)?;
+            signal_hook::low_level::pipe::register(signal, write).map_err(no_handler)?;
+        }
+        let announce = |ready: &[scanhub_sim::Ready]| {
+            if context.json {
+                let ports =
+                    ready.iter().map(|one| ReadyPort { port: &one.port, pty: one.pty.as_deref() }).collect();
+                say(&line(&SimulatorReady { class: "ready", ports }));
+            } else {
+                let ports: Vec<_> = ready.iter().map(|one| one.port.display().to_string()).collect();
+                say(&format!("ready {}", ports.join(" ")));
+            }
+        };
+        let mounts = SimulatedMounts::start(&self.angles, &options, &context.domain.of_publisher()?)?;
+        let report = |number, report| mounts.report(number, report);
+        scanhub_sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, report).map(drop)
+    }
+
+    fn options(&self) -> Result<SimulateOptions, Failure> {
         let servers = self.tcp.iter().map(|address| format!("tcp:{address}").into());
         let mode = self.mode.as_deref();
         let scanner = options::parse_family(&self.family, self.model.as_deref(), mode)?;
@@ -148,10 +180,31 @@ impl Simulate {
     }
 }
 
-/// The table of faults, for the end of the help.
-pub(crate) fn fault_table() -> String {
+/// Class `ready`.
+#[derive(Serialize)]
+struct SimulatorReady<'a> {
+    class: &'static str,
+    ports: Vec<ReadyPort<'a>>,
+}
+
+#[derive(Serialize)]
+struct ReadyPort<'a> {
+    port: &'a Path,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pty: Option<&'a Path>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  scanhub simulate --port /tmp/front --world room
+  scanhub simulate --port /tmp/front --fault loss=0.00135,burst=1.89
+  scanhub simulate --port /tmp/front --replay robot.mcap --sensor front
+  scanhub simulate --family rplidar --model a1 --tcp 127.0.0.1:0";
+
+/// Returns examples and the table of faults, for the end of the help.
+fn after_help() -> String {
     let rows = Faults::keys().map(|(key, meaning)| format!("  {key:13} {meaning}"));
-    format!("Faults:\n{}", rows.collect::<Vec<_>>().join("\n"))
+    format!("{EXAMPLES}\n\nFaults:\n{}", rows.collect::<Vec<_>>().join("\n"))
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! `scanhub web --replay`: a hub of this process alone whose sensors are a recording, and the picture of it, with the
-//! keys of the player. Both end together.
+//! `scanhub web --replay`: runs a hub in a domain of this process that plays a recording, and serves its picture. Viewers
+//! control the player. The hub and the server end together.
 
 use std::io::Write;
 use std::path::Path;
@@ -10,22 +10,18 @@ use std::thread;
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, PlaybackRate, Player};
 use scanhub_schema::{Failure, Kind};
+use scanhub_verbs::context::Context;
 use scanhub_viewer::WebArgs;
 use scanhub_viewer::server::player::{Playback, PlayerCommand, Progress};
 
-use crate::cli::Everywhere;
 use crate::own_domain::OwnDomain;
 
 /// Serves the picture of a hub, or with `--replay` that of a recording.
-pub(crate) fn run(
-    web: &WebArgs,
-    everywhere: &Everywhere,
-    out: &mut dyn Write,
-    stop: &Arc<AtomicBool>,
-) -> Result<(), Failure> {
+pub(crate) fn run(web: &WebArgs, context: &mut Context) -> Result<(), Failure> {
+    let (places, stop) = (context.domain.places()?, context.signals.stop()?);
     match &web.replay {
-        Some(file) => show(web, file, everywhere, out, stop),
-        None => web.run(&everywhere.places()?, everywhere.json, None, out, stop),
+        Some(file) => show(web, file, context.json, &mut context.out, &stop),
+        None => web.run(&places, context.json, None, &mut context.out, &stop),
     }
 }
 
@@ -33,11 +29,10 @@ pub(crate) fn run(
 fn show(
     web: &WebArgs,
     file: &Path,
-    everywhere: &Everywhere,
+    json: bool,
     out: &mut dyn Write,
     stop: &Arc<AtomicBool>,
 ) -> Result<(), Failure> {
-    everywhere.places()?;
     web.check()?;
     let domain = OwnDomain::new("web")?;
     let sources = Sources { files: Sources::system(), ..Sources::default() };
@@ -47,14 +42,14 @@ fn show(
         family: None,
         sources: &sources,
         play: PlaybackOptions { is_looped: web.is_looped, ..PlaybackOptions::default() },
-        // What was seen last stands until whoever looks has seen enough.
+        // Viewers keep the last picture until the user ends the verb.
         holds: true,
     };
     thread::scope(|scope| {
         let (ready, is_ready) = mpsc::channel();
         let (replay, domain) = (&replay, &domain);
         let hub = thread::Builder::new().name("hub".into()).spawn_scoped(scope, move || {
-            // Whichever way it ends, the page ends, too.
+            // The page ends with the hub, even if the hub panics.
             let _over = Over(stop);
             scanhub_daemon::replay(replay, domain, |_, player| {
                 let _ = ready.send(Keys(player.clone()));
@@ -63,18 +58,18 @@ fn show(
         let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let mut shown = Ok(());
         if let Ok(keys) = is_ready.recv() {
-            shown = web.run(std::slice::from_ref(domain), everywhere.json, Some(&keys), out, stop);
+            shown = web.run(std::slice::from_ref(domain), json, Some(&keys), out, stop);
             keys.0.end();
         }
         match hub.join() {
             Ok(played) => played.and(shown),
-            // It has said why.
+            // The panic has printed its reason.
             Err(_) => Err(Failure::new(Kind::Failed, "the hub of the recording ended", "start it again")),
         }
     })
 }
 
-/// The player, as viewers have it.
+/// The player that viewers control.
 struct Keys(Arc<Player>);
 
 impl Playback for Keys {
@@ -105,7 +100,7 @@ impl Playback for Keys {
     }
 }
 
-/// Ends what waits for `stop`.
+/// Sets `stop` when it is dropped.
 struct Over<'a>(&'a AtomicBool);
 
 impl Drop for Over<'_> {

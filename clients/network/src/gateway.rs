@@ -7,9 +7,8 @@ mod network;
 mod udp_destination;
 
 use std::collections::BTreeMap;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 use std::net::SocketAddr;
-use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -18,6 +17,7 @@ use clap::Args;
 use scanhub_schema::datagram::{Announce, GROUPS, MTU_SAFE, PORT, group};
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
+use scanhub_verbs::context::Context;
 use scanhub_verbs::duration;
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::lossy_writer::LossyWriter;
@@ -28,13 +28,14 @@ use crate::forward::{self, Forwarder, Selection};
 use crate::gateway_identity::begin_life;
 use crate::lan::Key;
 use crate::lan::outgoing::{ANNOUNCE_EVERY, Form};
-use crate::{VerbOptions, key_file, now};
+use crate::{key_file, now};
 use interface_monitor::InterfaceMonitor;
 use network::{Groups, Network};
 use udp_destination::{DestinationEvent, UdpDestination};
 
-/// Arguments of `scanhub gateway`. Those that are missing may come from section `gateway` of the configuration.
+/// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
 #[derive(Args, Clone, Debug, Default)]
+#[command(after_help = after_help())]
 pub struct GatewayArgs {
     /// Network interface for the groups: everybody on that network can read what is sent. Without it, nothing is sent
     /// to groups, and --to must name hosts. lo: this machine only
@@ -83,23 +84,18 @@ impl GatewayArgs {
     /// - [`Kind::NoTopic`] if the first hub has no such sensor,
     /// - [`Kind::Short`] if descriptors or memory are short,
     /// - [`Kind::Interrupted`] if `stop` is set before all hosts are resolved.
-    pub fn run(
-        &self,
-        options: &VerbOptions<'_>,
-        out: &mut (impl Write + AsFd),
-        notes: &mut (impl Write + AsFd),
-        tell: &AtomicBool,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
-        let display = match (options.json, out.as_fd().is_terminal()) {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
+        let display = match (context.json, context.is_terminal) {
             (true, _) => Display::Json,
             (false, true) => Display::Terminal,
             (false, false) => Display::Lines,
         };
-        let mut gateway = Gateway::open(self, &options.places()?, stop)?;
-        let (mut out, mut notes) = (LossyWriter::around(out, stop), LossyWriter::around(notes, stop));
+        let mut gateway = Gateway::open(self, &context.domain.places()?, &stop)?;
+        let (mut out, mut notes) =
+            (LossyWriter::around(&mut context.out, &stop), LossyWriter::around(&mut context.notes, &stop));
         let mut report = Report::new(display, &mut out, &mut notes);
-        quiet(gateway.run(&mut report, tell, stop))
+        quiet(gateway.run(&mut report, &tell, &stop))
     }
 
     /// Checks everything that needs neither network nor hub: the topics, and which options exclude each other.
@@ -475,9 +471,13 @@ const NO_KEY: &str = "receivers cannot know who sends; see `scanhub key new` and
 /// Moves the cursor to the start of the line, and clears it (ECMA-48).
 const CLEAR_LINE: &[u8] = b"\r\x1b[K";
 
-/// Returns the groups and their topics, for the end of the help.
-pub fn groups_help() -> String {
-    let mut text = format!("Groups, port {PORT}:\n");
+const EXAMPLE: &str = "\
+Example:
+  scanhub gateway --interface eth0 --topic '*/zones' --topic front/scan:every=4";
+
+/// Returns an example, and the groups with their topics, for the end of the help.
+fn after_help() -> String {
+    let mut text = format!("{EXAMPLE}\n\nGroups, port {PORT}:\n");
     for (address, topics) in groups_and_topics() {
         text += &format!("  {address}  {topics}\n");
     }
@@ -521,7 +521,7 @@ mod tests {
 
     #[test]
     fn help_lists_every_topic_with_its_group() {
-        let help = groups_help();
+        let help = after_help();
         for (address, topics) in groups_and_topics() {
             assert!(help.contains(&format!("{address}  {topics}\n")), "{help}");
         }

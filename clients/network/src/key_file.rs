@@ -15,9 +15,11 @@ use scanhub_verbs::output::{Output, quiet};
 use serde_json::json;
 
 use crate::lan::Key;
+use scanhub_verbs::context::Context;
 
-/// Arguments of `scanhub key`.
+/// Make the key that gateways and listeners share
 #[derive(Args, Debug)]
+#[command(after_help = "Example:\n  scanhub key new lan.key")]
 pub struct KeyArgs {
     #[command(subcommand)]
     command: KeyCommand,
@@ -26,6 +28,7 @@ pub struct KeyArgs {
 #[derive(Debug, Subcommand)]
 enum KeyCommand {
     /// Make a file with a new key, readable for this user only
+    #[command(after_help = "Example:\n  scanhub key new lan.key")]
     New {
         /// The file; it must not exist
         file: PathBuf,
@@ -38,9 +41,9 @@ impl KeyArgs {
     /// # Errors
     ///
     /// Returns [`Kind::Output`] if the file exists or cannot be written.
-    pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let KeyCommand::New { file } = &self.command;
-        new_key(file, json, out)
+        new_key(file, context.json, &mut context.out)
     }
 }
 

@@ -14,9 +14,7 @@
 
 mod multicast_receiver;
 
-use std::io::{IsTerminal, Write};
 use std::net::SocketAddrV4;
-use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -26,15 +24,17 @@ use scanhub_schema::datagram::{Announce, group};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::{Domain, StateDirectory};
+use scanhub_verbs::context::Context;
 use scanhub_verbs::follow::Bounds;
 use scanhub_verbs::output::{End, Output, quiet};
 
 use self::multicast_receiver::{MAX_DATAGRAM_LEN, MulticastReceiver};
+use crate::key_file;
 use crate::reception::{Origin, Reception, Wanted, Words};
-use crate::{VerbOptions, key_file};
 
-/// Arguments of `scanhub listen`.
+/// Receive what gateways of other machines send, and show what was lost
 #[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
 pub struct ListenArgs {
     /// Network interface to listen on [default: all that have a link]
     #[arg(long, value_name = "IF")]
@@ -71,7 +71,11 @@ pub struct ListenArgs {
 }
 
 /// Signals, for the end of the help.
-pub const LISTEN_SIGNALS: &str = "SIGUSR1: print the counts so far";
+const AFTER_HELP: &str = "\
+Example:
+  scanhub listen --interface eth0 --stats
+
+SIGUSR1: print the counts so far";
 
 impl ListenArgs {
     /// Prints received samples to `out`, and the counters at the end and whenever `tell` is set. Everything else goes
@@ -91,16 +95,10 @@ impl ListenArgs {
     /// - [`Kind::Short`] if there is too little memory for that,
     /// - [`Kind::Failed`] if the port is not available,
     /// - [`Kind::Timeout`], or [`Kind::Interrupted`] if `stop` is set before the bounds are reached.
-    pub fn run(
-        &self,
-        options: &VerbOptions<'_>,
-        out: &mut (impl Write + AsFd),
-        notes: &mut dyn Write,
-        tell: &AtomicBool,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
-        let publish = self.publish.then(|| options.publisher_domain()).transpose()?;
-        let is_drawn = self.stats && !options.json && out.as_fd().is_terminal();
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
+        let publish = self.publish.then(|| context.domain.of_publisher()).transpose()?;
+        let is_drawn = self.stats && !context.json && context.is_terminal;
         let topics = topics(&self.topics)?;
         let key = self.key_file.as_deref().map(key_file::read).transpose()?;
         let (groups, now) = (groups(&topics), Instant::now());
@@ -111,19 +109,19 @@ impl ListenArgs {
             names: &self.names,
             hubs: &self.hubs,
             key,
-            state: StateDirectory::of_domain(options.domain),
+            state: StateDirectory::of_domain(&context.domain.name),
             publish: publish.as_ref(),
             limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },
             memory: u64::from(self.memory) << 20,
             only_proven: self.key_file.is_none(),
             stats: self.stats,
         };
-        let (out, notes) = (Output::new(out), Output::new(notes));
-        let reception = Reception::open(wanted, options.json, Words::LAN, out, notes)?;
+        let (out, notes) = (Output::new(&mut context.out), Output::new(&mut context.notes));
+        let reception = Reception::open(wanted, context.json, Words::LAN, out, notes)?;
         let receiver = MulticastReceiver::open(self.interface.as_deref(), &groups, now)?;
         let mut listener =
             Listener { args: self, publish, is_drawn, receiver, reception, started: now, draw_at: now };
-        quiet(listener.listen(tell, stop))
+        quiet(listener.listen(&tell, &stop))
     }
 }
 

@@ -8,6 +8,7 @@ use std::ffi::OsStr;
 use clap::Parser;
 use fake::{FakeHub, Place, Verb, until};
 use scanhub_perception::verbs::TrackArgs;
+use scanhub_verbs::context::{Context, DomainOptions};
 
 #[derive(Parser)]
 struct Arguments {
@@ -37,8 +38,10 @@ fn reported(json: bool, text: &str) -> (String, String) {
     let site = place.base.join("site.toml");
     std::fs::write(&site, SITE).unwrap();
     let args = Arguments::parse_from([OsStr::new("track"), OsStr::new("--site"), site.as_os_str()]).track;
-    let places = place.places();
-    let verb = Verb::start(move |out, notes, stop| args.run(json, &places, out, notes, stop));
+    let domain = DomainOptions { name: place.domain.name().to_owned(), root: Some(place.base.clone()) };
+    let verb = Verb::start(move |out, notes, stop| {
+        args.run(&mut Context::new(json, domain, (out, notes), Box::new(stop)))
+    });
     for sensor in &hub.sensors {
         sensor.scan.await_subscribers(1);
         sensor.foreground.await_subscribers(1);

@@ -1,10 +1,8 @@
 //! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. Files are
 //! handled here; the hub gets models only.
 
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, SystemTime};
 
 use clap::{Args, Subcommand};
@@ -14,16 +12,17 @@ use scanhub_files::regular;
 use scanhub_schema::{
     Age, Background, BackgroundHead, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
 };
-use scanhub_shm::Domain;
 use serde::Serialize;
 
+use crate::context::Context;
 use crate::control::confirm;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
 use crate::text;
 
-/// Arguments of `background`.
+/// Show, reset, freeze, save or load the background model of a sensor
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub background front save front.json")]
 pub struct BackgroundArgs {
     /// The sensor
     pub sensor: String,
@@ -36,14 +35,19 @@ pub struct BackgroundArgs {
 #[derive(Clone, Debug, PartialEq, Eq, Subcommand)]
 pub enum ModelOrder {
     /// Show how many beams are known; with --json, every range
+    #[command(after_help = "Example:\n  scanhub background front show")]
     Show,
     /// Forget the model and learn it again
+    #[command(after_help = "Example:\n  scanhub background front reset")]
     Reset,
     /// Freeze the model: stop learning
+    #[command(after_help = "Example:\n  scanhub background front freeze")]
     Freeze,
     /// Continue learning
+    #[command(after_help = "Example:\n  scanhub background front thaw")]
     Thaw,
     /// Save the model to a file
+    #[command(after_help = "Example:\n  scanhub background front save front.json")]
     Save {
         /// The file; - is stdout
         file: PathBuf,
@@ -52,6 +56,7 @@ pub enum ModelOrder {
         force: bool,
     },
     /// Load a saved model
+    #[command(after_help = "Example:\n  scanhub background front load front.json")]
     Load {
         /// The file; - is stdin
         file: PathBuf,
@@ -62,33 +67,30 @@ pub enum ModelOrder {
 }
 
 impl BackgroundArgs {
-    /// Sends the request to the hub in one of `places` and writes a line to `out`. Reads the model to load before it calls
-    /// `interrupt`, whose flag would not end the read of a terminal.
+    /// Sends the request to the hub and writes a line to `out`. Reads the model to load before it installs handlers for
+    /// signals, because a flag would not end the read of a terminal.
     ///
     /// # Errors
     ///
-    /// - The errors of [`saved_model`] and of `interrupt`.
+    /// - The errors of [`saved_model`].
     /// - [`Kind::Configuration`] if the hub refuses a model.
     /// - [`Kind::Output`] if a file exists or cannot be written.
     /// - [`Kind::Failed`] if there is no model yet to be saved.
-    /// - The errors of [`ControlArgs::run`](crate::ControlArgs::run).
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        input: &mut dyn Read,
-        out: &mut dyn Write,
-        interrupt: impl FnOnce() -> Result<Arc<AtomicBool>, Failure>,
-    ) -> Result<(), Failure> {
+    /// - The errors of [`ControlArgs::run`](crate::control::ControlArgs::run).
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let json = context.json;
+        let places = context.domain.places()?;
         let sensor = &self.sensor;
         let loaded = match &self.order {
-            ModelOrder::Load { file, any_sensor } => Some(saved_model(file, sensor, *any_sensor, input)?),
+            ModelOrder::Load { file, any_sensor } => {
+                Some(saved_model(file, sensor, *any_sensor, &mut io::stdin())?)
+            }
             _ => None,
         };
-        let stop = interrupt()?;
+        let stop = context.signals.stop()?;
         as_word(check_sensor(sensor))?;
-        let ask = |verb| request(places, &Request::new(sensor, verb), &stop);
-        let mut output = Output::new(out);
+        let ask = |verb| request(&places, &Request::new(sensor, verb), &stop);
+        let mut output = Output::new(&mut context.out);
         let verb = match &self.order {
             ModelOrder::Show => {
                 let Shown { model, kept_wall_ns } = shown(sensor, ask(Verb::Show)?)?;
@@ -118,7 +120,7 @@ impl BackgroundArgs {
             ModelOrder::Load { .. } => Verb::Load,
         };
         match &loaded {
-            Some(model) => request(places, &Request::load(sensor, model), &stop)?,
+            Some(model) => request(&places, &Request::load(sensor, model), &stop)?,
             None => ask(verb)?,
         };
         let is_frozen = verb == Verb::Reset && !json && shown(sensor, ask(Verb::Show)?)?.model.is_frozen();

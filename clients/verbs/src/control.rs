@@ -2,20 +2,20 @@
 //! when the link has accepted the request; `info` shows the progress.
 
 use std::io::Write;
-use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use scanhub_client::request;
 use scanhub_schema::{Failure, Request, Verb, check_sensor};
-use scanhub_shm::Domain;
 
+use crate::context::Context;
 use crate::json;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
 
-/// Arguments of `control`.
+/// Pause a sensor, resume it, or restart its session
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub control front pause")]
 pub struct ControlArgs {
     /// The sensor
     sensor: String,
@@ -35,16 +35,11 @@ impl ControlArgs {
     /// # Errors
     ///
     /// Returns the errors of [`request`], and [`Kind::Usage`](scanhub_schema::Kind) if the sensor's name is not valid.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         as_word(check_sensor(&self.sensor))?;
-        request(places, &Request::new(&self.sensor, self.verb), stop)?;
-        confirm(&mut Output::new(out), json, &self.sensor, self.verb)
+        request(&places, &Request::new(&self.sensor, self.verb), &stop)?;
+        confirm(&mut Output::new(&mut context.out), context.json, &self.sensor, self.verb)
     }
 }
 

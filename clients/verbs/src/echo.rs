@@ -1,22 +1,20 @@
 //! `scanhub echo`: samples as text, JSON, CSV or bytes.
 
-use std::io::Write;
-use std::sync::atomic::AtomicBool;
-
 use clap::Args;
 use scanhub_client::streams::Sample;
 use scanhub_schema::csv::ScanColumns;
 use scanhub_schema::{Failure, Header, Kind, Scan, Topic};
-use scanhub_shm::Domain;
 
+use crate::context::Context;
 use crate::follow::{Bounds, Event, Following};
 use crate::names::{Selection, TopicName};
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
 use crate::{json, show, text};
 
-/// Arguments of `echo`.
+/// Print samples as they arrive
 #[derive(Args, Clone, Debug, Default)]
+#[command(after_help = EXAMPLES)]
 pub struct EchoArgs {
     /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics; robot/zones for the verdict over all
     /// sensors
@@ -39,6 +37,12 @@ pub struct EchoArgs {
     pub bounds: Bounds,
 }
 
+const EXAMPLES: &str = "\
+Examples:
+  scanhub echo front/scan
+  scanhub echo front/zones --json -n 10
+  scanhub echo front/scan --csv > scans.csv";
+
 impl EchoArgs {
     /// Writes the samples of topics to `out` as they arrive. Notices go to `notes` (stderr) if `out` is not JSON. Ends at the
     /// limits, when `stop` is set, or when the reader of `out` has closed it.
@@ -49,24 +53,23 @@ impl EchoArgs {
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;
-        let format = match (json, self.csv, self.raw) {
+        let format = match (context.json, self.csv, self.raw) {
             (true, ..) => Format::Json,
             (_, true, _) => Format::Csv(ScanColumns { meters: self.meters, intensities: self.intensities }),
             (_, _, true) => Format::Raw,
             _ => Format::Text,
         };
         check(format, &named, &of_all)?;
-        let mut echo = Echo { format, out: Output::new(out), notes: Output::new(notes), beams: None };
-        let mut following = Following::new(&named, &of_all, places, &self.bounds, stop).with_lines();
+        let mut echo = Echo {
+            format,
+            out: Output::new(&mut context.out),
+            notes: Output::new(&mut context.notes),
+            beams: None,
+        };
+        let mut following = Following::new(&named, &of_all, &places, &self.bounds, &stop).with_lines();
         let end = echo.run(&mut following);
         quiet(following.finish(end, |name, stats| echo.summary(name, stats)))
     }

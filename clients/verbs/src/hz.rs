@@ -3,23 +3,23 @@
 use std::collections::VecDeque;
 use std::io::Write;
 use std::rc::Rc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use clap::Args;
 use scanhub_client::clock;
 use scanhub_schema::{Failure, Status, Topic};
-use scanhub_shm::Domain;
 use serde::Serialize;
 
+use crate::context::Context;
 use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{Selection, TopicName};
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
 use crate::{duration, json, text};
 
-/// Arguments of `hz`.
+/// Measure rate, jitter and loss of topics
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub hz front/scan --for 10s")]
 pub struct HzArgs {
     /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
     #[arg(value_name = "SENSOR/TOPIC")]
@@ -44,31 +44,25 @@ const MIN_WINDOW: Duration = Duration::from_millis(500);
 
 impl HzArgs {
     /// Writes a line per topic and second to `out`, and summaries at the end. Notices go to `notes` (stderr) if `out` is not
-    /// JSON. Ends as [`EchoArgs::run`](crate::EchoArgs::run) does.
+    /// JSON. Ends as [`EchoArgs::run`](crate::echo::EchoArgs::run) does.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`EchoArgs::run`](crate::EchoArgs::run).
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    /// Returns the errors of [`EchoArgs::run`](crate::echo::EchoArgs::run).
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;
         let of_all = if self.topics.is_empty() { Topic::ALL.to_vec() } else { of_all };
         let mut hz = Hz {
-            json,
+            json: context.json,
             length: self.window,
             windows: Vec::new(),
             lines: Vec::new(),
             next: Instant::now() + EVERY,
-            out: Output::new(out),
-            notes: Output::new(notes),
+            out: Output::new(&mut context.out),
+            notes: Output::new(&mut context.notes),
         };
-        let mut following = Following::new(&named, &of_all, places, &self.bounds, stop).with_lines();
+        let mut following = Following::new(&named, &of_all, &places, &self.bounds, &stop).with_lines();
         let end = hz.run(&mut following);
         quiet(following.finish(end, |name, stats| hz.summary(name, stats)))
     }

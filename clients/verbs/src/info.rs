@@ -1,6 +1,5 @@
 //! `scanhub info`: the state of the links and their sensors, from the last status that each has published.
 
-use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -10,12 +9,14 @@ use scanhub_client::streams::{Follower, GRACE, Session, find};
 use scanhub_schema::{Counter, Failure, Family, Kind, Pose, Status, check_followed};
 use scanhub_shm::{Domain, is_starting};
 
+use crate::context::Context;
 use crate::json;
 use crate::names::{as_word, no_sensor};
 use crate::output::{Output, quiet, table};
 
-/// Arguments of `info`.
+/// Show state, settings and counters of sensors
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub info front")]
 pub struct InfoArgs {
     /// Show only this sensor
     pub sensor: Option<String>,
@@ -30,24 +31,19 @@ impl InfoArgs {
     /// - [`Kind::NoTopic`] if the sensor does not exist; the message lists the sensors.
     /// - [`Kind::Timeout`] if a sensor's status does not arrive.
     /// - [`Kind::Interrupted`] if `stop` is set.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         self.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-        let domain = find(places)?;
+        let domain = find(&places)?;
         let sensors = wanted(self.sensor.as_deref(), &domain)?;
         let now_ns = clock::now().monotonic_ns;
-        let mut output = Output::new(out);
-        for (sensor, status) in statuses(&domain, &sensors, stop)? {
+        let mut output = Output::new(&mut context.out);
+        for (sensor, status) in statuses(&domain, &sensors, &stop)? {
             let Some(status) = status else {
                 let hint = "the hub is there and does not publish: look at its log";
                 return Err(Failure::new(Kind::Timeout, format!("no status of {sensor} arrived"), hint));
             };
-            quiet(if json {
+            quiet(if context.json {
                 output.json(&json::status(&sensor, &status))
             } else {
                 table(&mut output, &properties(&sensor, &status, now_ns))

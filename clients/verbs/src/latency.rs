@@ -5,27 +5,26 @@ mod conditions;
 mod spans;
 
 use std::io::{self, Write};
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
 use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Flags, Kind};
-use scanhub_shm::Domain;
 use serde::Serialize;
 
 use self::conditions::Conditions;
 use self::spans::{Quantiles, Span, Spans};
+use crate::context::Context;
 use crate::follow::{Arrival, Bounds, Event, Following, Notice};
 use crate::names::TopicName;
 use crate::output::{End, Output, quiet, table};
 use crate::receive_stats::ReceiveStats;
 use crate::{duration, json, text};
 
-/// Arguments of `latency`.
+/// Measure how old samples are on arrival, split into line, hub and wake-up: percentiles
 #[derive(Args, Clone, Debug)]
-#[command(after_help = SPANS)]
+#[command(after_help = AFTER_HELP)]
 pub struct LatencyArgs {
     /// Topics to follow: front/scan, rear/telegram, robot1.front/zones ..
     #[arg(required = true, value_name = "SENSOR/TOPIC")]
@@ -53,7 +52,11 @@ enum WaitBy {
     Spin,
 }
 
-const SPANS: &str = "line: first byte to last; network: a remote sensor's first byte to the arrival on this \
+const AFTER_HELP: &str = "\
+Example:
+  scanhub latency front/scan --for 10s --max-p99 1ms
+
+line: first byte to last; network: a remote sensor's first byte to the arrival on this \
 machine, by the wall clocks of both; hub: last byte until sent; wake: sent until received; age: last byte, or arrival on \
 this machine, until received, which --max-p99 checks; total: all of it\n\n\
 To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p99 1ms";
@@ -63,22 +66,15 @@ const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 impl LatencyArgs {
     /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end to `out`. Each line
-    /// covers the run so far. Without `json`, conditions and notices go to `notes` (stderr). The result has bars if
-    /// `is_terminal`.
+    /// covers the run so far. Without `json`, conditions and notices go to `notes` (stderr). The result has bars on
+    /// a terminal.
     ///
     /// # Errors
     ///
     /// - [`Kind::Check`] if a topic is older than `--max-p99` permits, or its age is unknown.
-    /// - The errors of [`echo`](crate::EchoArgs::run).
-    pub fn run(
-        &self,
-        json: bool,
-        is_terminal: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    /// - The errors of [`echo`](crate::echo::EchoArgs::run).
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let mut names: Vec<TopicName> = Vec::new();
         for text in &self.topics {
             let name = TopicName::parse(text)?;
@@ -92,15 +88,15 @@ impl LatencyArgs {
             WaitBy::Spin => Wait::Spin,
         };
         let mut latency = Latency {
-            is_json: json,
-            is_terminal,
+            is_json: context.json,
+            is_terminal: context.is_terminal,
             topics: names.iter().map(|name| (name.clone(), Spans::new())).collect(),
             next: Instant::now() + LINE_INTERVAL,
-            out: Output::new(out),
-            notes: Output::new(notes),
+            out: Output::new(&mut context.out),
+            notes: Output::new(&mut context.notes),
         };
         let written = latency.conditions(&Conditions::take(wait, !self.no_realtime));
-        let mut following = Following::new(&names, &[], places, &self.bounds, stop).closely(wait);
+        let mut following = Following::new(&names, &[], &places, &self.bounds, &stop).closely(wait);
         let end = written.and_then(|()| {
             let end = latency.run(&mut following);
             following.finish(end, |name, stats| latency.summary(name, stats))

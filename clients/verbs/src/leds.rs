@@ -4,30 +4,28 @@
 
 mod device;
 
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 use std::mem;
-use std::os::fd::AsFd;
 use std::path::PathBuf;
 use std::rc::Rc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use clap::Args;
 use scanhub_client::clock;
 use scanhub_client::streams::{Freshness, Sample};
 use scanhub_schema::{Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
-use scanhub_shm::Domain;
 use serde::Serialize;
 
 use self::device::{Device, News};
+use crate::context::Context;
 use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, colors, quiet};
 use crate::{duration, json, text};
 
-/// Arguments of `leds`.
+/// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
 #[derive(Args, Clone, Debug)]
-#[command(after_help = MEANING)]
+#[command(after_help = AFTER_HELP)]
 pub struct LedsArgs {
     /// The sensor, or robot for the verdict over all sensors
     sensor: String,
@@ -48,7 +46,12 @@ pub struct LedsArgs {
     bounds: Bounds,
 }
 
-const MEANING: &str = "green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub leds front
+  scanhub leds robot --led green=led0
+
+green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
 
 impl LedsArgs {
     /// Shows the lights on `out` and on the LEDs until the limits are reached or `stop` is set. Notices go to `notes` (stderr)
@@ -59,15 +62,9 @@ impl LedsArgs {
     ///
     /// - [`Kind::Configuration`] if an LED does not exist or its light is unknown.
     /// - [`Kind::Failed`] if an LED may not be switched.
-    /// - The errors of [`echo`](crate::EchoArgs::run).
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut (impl Write + AsFd),
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    /// - The errors of [`echo`](crate::echo::EchoArgs::run).
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let sensor = &self.sensor;
         let topics = if sensor == ROBOT { &[Topic::Zones][..] } else { &[Topic::Zones, Topic::Marks] };
         if sensor != ROBOT {
@@ -77,7 +74,7 @@ impl LedsArgs {
         let wanted = self.wanted()?;
         let mut board = Board {
             sensor,
-            look: match (json, out.as_fd().is_terminal()) {
+            look: match (context.json, context.is_terminal) {
                 (true, _) => Look::Json,
                 (false, true) => Look::Terminal { colors: colors() },
                 (false, false) => Look::Lines,
@@ -87,10 +84,10 @@ impl LedsArgs {
             marks: Freshness::new(clock::now()),
             losses: Vec::new(),
             devices: Vec::new(),
-            out: Output::new(out),
-            notes: Output::new(notes),
+            out: Output::new(&mut context.out),
+            notes: Output::new(&mut context.notes),
         };
-        let mut following = Following::new(&names, &[], places, &self.bounds, stop).with_lines();
+        let mut following = Following::new(&names, &[], &places, &self.bounds, &stop).with_lines();
         if self.early {
             following = following.with_early();
         }

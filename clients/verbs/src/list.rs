@@ -2,7 +2,6 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
@@ -12,11 +11,13 @@ use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
 use scanhub_shm::{Node, Payload, PortFactory};
 use serde::{Serialize, Serializer};
 
+use crate::context::Context;
 use crate::info::statuses;
 use crate::output::{Output, quiet, table};
 
-/// Arguments of `list`.
+/// List the sensors and topics of the running hub
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub list")]
 pub struct ListArgs {
     /// List every live domain of this user instead
     #[arg(long)]
@@ -24,30 +25,26 @@ pub struct ListArgs {
 }
 
 impl ListArgs {
-    /// Writes the topics of every sensor of the hub of `domain` to `out`, with rate, subscribers, payload type and revision.
-    /// As text, the problem of each sensor that has one follows. The hub is below `root`, if given.
+    /// Writes the topics of every sensor of the hub to `out`, with rate, subscribers, payload type and revision. As text, the
+    /// problem of each sensor that has one follows.
     ///
-    /// With `--domains`, writes every live domain instead, those below `root` or all. Hubs that this user cannot reach follow,
+    /// With `--domains`, writes every live domain instead, those below the root that the user named or all. Hubs that this user cannot reach follow,
     /// with a command that does.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoHub`](scanhub_schema::Kind) within a second if no hub runs.
-    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if the flag of `interrupt` is set.
-    /// - The errors of [`Domain::candidates`] and of `interrupt`, and that of a write to `out`.
-    pub fn run(
-        &self,
-        json: bool,
-        domain: &str,
-        root: Option<&Path>,
-        out: &mut dyn Write,
-        interrupt: impl FnOnce() -> Result<Arc<AtomicBool>, Failure>,
-    ) -> Result<(), Failure> {
-        let environment = Environment::of_process();
-        match (self.domains, root) {
-            (false, _) => topics(json, &Domain::candidates(domain, root, &environment)?, out, &*interrupt()?),
+    /// - [`Kind::Interrupted`](scanhub_schema::Kind) if a signal requests the end.
+    /// - The errors of [`Domain::candidates`], and that of a write to `out`.
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (json, out) = (context.json, &mut context.out);
+        match (self.domains, &context.domain.root) {
+            (false, _) => topics(json, &context.domain.places()?, out, &*context.signals.stop()?),
             (true, Some(root)) => domains(json, &[root.to_owned()], &[], out),
-            (true, None) => domains(json, &environment.bases(), &RunningHub::all(Path::new("/")), out),
+            (true, None) => {
+                let hubs = RunningHub::all(Path::new("/"));
+                domains(json, &Environment::of_process().bases(), &hubs, out)
+            }
         }
     }
 }

@@ -17,7 +17,7 @@ mod report;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, IsTerminal, Write};
+use std::io::{self, ErrorKind, IsTerminal};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -38,15 +38,16 @@ use self::files::{Files, Split};
 use self::part::{Form, Style};
 use self::queue::{Entry, Gap, News, Queue, WriterProgress};
 use self::report::{Look, Report};
+use crate::context::Context;
 use crate::follow::{Bounds, Event, Following};
 use crate::lossy_writer::LossyWriter;
 use crate::names::{Selection, TopicName};
 use crate::output::{End, quiet};
 use crate::receive_stats::ReceiveStats;
 
-/// Arguments of `record`.
+/// Record what the hub publishes in MCAP files
 #[derive(Args, Clone, Debug)]
-#[command(after_help = READING)]
+#[command(after_help = AFTER_HELP)]
 pub struct RecordArgs {
     /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics [default: telegram, marks,
     /// zones, foreground and status of all sensors, tracks and events of trackers, tilt and obstacles of mounts]
@@ -77,7 +78,13 @@ pub struct RecordArgs {
     bounds: Bounds,
 }
 
-const READING: &str = "\
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub record
+  scanhub record --ros2 -o ros.mcap --for 10m
+  scanhub record --all --split 512MiB --keep 20
+  scanhub record -o walk.mcap --split 1h --keep 20 --force
+
 The files are MCAP: any MCAP reader opens them, `scanhub replay FILE` plays them. Ctrl-C finishes the file. On a full
 disk it waits and continues; it reports what is missing, which is a gap in the file's numbers.";
 
@@ -115,44 +122,30 @@ impl RecordArgs {
     /// - [`Kind::Usage`] if the topics or stdout cannot be recorded.
     /// - [`Kind::Output`] if no file can be made, and [`Kind::Failed`] if its end cannot be written; [`Kind::Short`] if either
     ///   is for lack of space.
-    /// - The errors of [`echo`](crate::EchoArgs::run).
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut (impl Write + AsFd),
-        notes: &mut (impl Write + AsFd),
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
-        match self.is_to_stdout() {
-            true => self.record(json, places, &mut io::stderr(), notes, stop),
-            false => self.record(json, places, out, notes, stop),
-        }
-    }
-
-    fn record(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut (impl Write + AsFd),
-        notes: &mut (impl Write + AsFd),
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
-        let look = match (json, out.as_fd().is_terminal()) {
+    /// - The errors of [`echo`](crate::echo::EchoArgs::run).
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        // The file is finished, no matter which signal ends the run.
+        let (places, stop) = (context.domain.places()?, context.signals.any_end()?);
+        // If stdout carries the recording, the progress goes to stderr as well.
+        let mut stderr =
+            self.is_to_stdout().then(|| context.notes.try_clone()).transpose().map_err(no_stderr)?;
+        let out = stderr.as_mut().unwrap_or(&mut context.out);
+        let look = match (context.json, out.is_terminal()) {
             (true, _) => Look::Json,
             (false, true) => Look::Terminal,
             (false, false) => Look::Lines,
         };
         let (names, topics) = selection(&self.topics, self.all, self.ros2)?;
         let queue = Arc::new(Queue::new());
-        let disk = match self.begin(places, &queue) {
+        let disk = match self.begin(&places, &queue) {
             Ok(disk) => disk,
             Err(end) => return quiet(Err(end)),
         };
         let (first, older) = (disk.path(), disk.surplus_older());
         let over = AtomicBool::new(false);
         let terminal = out.as_fd().try_clone_to_owned().ok();
-        let (mut out, mut notes) = (LossyWriter::around(out, &over), LossyWriter::around(notes, &over));
+        let (mut out, mut notes) =
+            (LossyWriter::around(out, &over), LossyWriter::around(&mut context.notes, &over));
         let mut report = Report::new(look, &mut out, &mut notes, terminal);
         let begun = report.begin(&first, older);
         let mut recorder = Recorder {
@@ -169,14 +162,14 @@ impl RecordArgs {
         let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
         let writing = writing
             .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
-        let mut following = Following::new(&names, &topics, places, &self.bounds, stop).with_lines();
+        let mut following = Following::new(&names, &topics, &places, &self.bounds, &stop).with_lines();
         let end = begun.and_then(|()| {
             let end = recorder.run(&mut following);
             following.finish(end, |name, stats| recorder.summary(name, stats))
         });
         // The recording is kept if the hub or the reader of the lines went away.
         let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
-        let finished = recorder.finish(writing, stays, stop);
+        let finished = recorder.finish(writing, stays, &stop);
         if !stays && !self.is_to_stdout() {
             // Without the hub or sensor, the run leaves no file.
             files::discard(&first);
@@ -464,6 +457,10 @@ fn no_file(path: &Path, is_split: bool, error: &io::Error) -> Failure {
         other => other,
     };
     Failure::new(kind, format!("cannot record into {}: {error}", path.display()), hint)
+}
+
+fn no_stderr(error: io::Error) -> Failure {
+    Failure::new(Kind::Failed, format!("no stderr: {error}"), "")
 }
 
 /// Returns the failure that the reader of stdout went away. It has an incomplete recording.

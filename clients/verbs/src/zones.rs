@@ -4,25 +4,26 @@
 mod body;
 
 use std::fmt::Write as _;
-use std::io::Write;
+use std::fs::File;
+use std::io::{IsTerminal, Write};
 use std::rc::Rc;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use clap::{Args, Subcommand};
 use scanhub_client::streams::Sample;
 use scanhub_schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
-use scanhub_shm::Domain;
 use serde::Serialize;
 
 use self::body::{Body, Mask, SLICES, Sector};
+use crate::context::Context;
 use crate::follow::{Bounds, Event, Following, Notice};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
 use crate::{duration, text};
 
-/// Arguments of `zones`.
+/// Learn which part of a sensor's view is the robot itself
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
 pub struct ZonesArgs {
     /// The sensor
     sensor: String,
@@ -34,6 +35,7 @@ pub struct ZonesArgs {
 enum Order {
     /// Learn what the sensor sees of its own robot, and print it as configuration. Place the robot in an open area with
     /// nobody near it
+    #[command(after_help = "Example:\n  scanhub zones front mask --for 10s")]
     Mask {
         /// How long to look, for example 10s
         #[arg(long = "for", default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
@@ -47,24 +49,17 @@ enum Order {
 
 impl ZonesArgs {
     /// Follows the sensor for a while, then writes its mask to `out` as TOML for the hub, and doubts about it to `notes`
-    /// (stderr). Calls `progress` with the state of the run, and with nothing before a note.
+    /// (stderr). A terminal there shows the progress.
     ///
     /// # Errors
     ///
     /// - [`Kind::Configuration`] if a value is not possible.
-    /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as [`EchoArgs::run`](crate::EchoArgs::run).
+    /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as [`EchoArgs::run`](crate::echo::EchoArgs::run).
     /// - [`Kind::Timeout`] if too few scans arrived.
     /// - [`Kind::Failed`] if the hub went away, or the sensor's settings changed meanwhile.
     /// - [`Kind::Interrupted`] if `stop` is set.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        progress: &mut dyn FnMut(Option<&str>),
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let (sensor, Order::Mask { run_for, within }) = (&self.sensor, &self.order);
         as_word(check_sensor(sensor))?;
         if let Some(within_m) = within.filter(|metres| !(0.001..=FARTHEST_M).contains(metres)) {
@@ -91,20 +86,21 @@ impl ZonesArgs {
             verdicts: 0,
             violated: 0,
             body: None,
-            notes: Output::new(notes),
-            progress,
+            is_shown: context.notes.is_terminal().then_some(false),
+            notes: &mut context.notes,
             told: 0,
         };
-        quiet(look.run(&mut Following::new(&names, &[], places, &bounds, stop)))?;
+        let end = quiet(look.run(&mut Following::new(&names, &[], &places, &bounds, &stop)));
+        look.clear();
+        end?;
         let (body, within_mm) = look.seen(sensor)?;
         let (scans, mask) = (body.scans(), body.mask());
         let is_violated = look.is_violated();
         let found = Found { sensor, run_for: *run_for, within_mm, scans, mask, is_violated };
-        let Look { mut notes, progress, .. } = look;
-        progress(None);
+        let mut notes = Output::new(&mut context.notes);
         quiet(found.doubts().iter().try_for_each(|doubt| notes.line(|line| write!(line, "{doubt}"))))?;
-        let mut output = Output::new(out);
-        quiet(if json {
+        let mut output = Output::new(&mut context.out);
+        quiet(if context.json {
             output.json(&found.object())
         } else {
             found.toml().lines().try_for_each(|text| output.line(|line| write!(line, "{text}")))
@@ -123,9 +119,10 @@ struct Look<'a> {
     /// Those of them in which the largest circle is violated.
     violated: u32,
     body: Option<Body>,
-    notes: Output<'a>,
-    progress: &'a mut dyn FnMut(Option<&str>),
-    /// Whole seconds that were told.
+    notes: &'a mut File,
+    /// Whether the line of progress is shown; `None` if `notes` is not a terminal, which never has the line.
+    is_shown: Option<bool>,
+    /// Number of seconds whose progress was shown.
     told: u64,
 }
 
@@ -202,8 +199,8 @@ impl Look<'_> {
         if notice == Notice::HubGone {
             return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
         }
-        (self.progress)(None);
-        self.notes.line(|line| text::notice(line, names, &notice))
+        self.clear();
+        Output::new(self.notes).line(|line| text::notice(line, names, &notice))
     }
 
     fn tick(&mut self, now: Instant) {
@@ -211,8 +208,22 @@ impl Look<'_> {
         if seconds >= self.told {
             self.told = seconds + 1;
             let scans = self.body.as_ref().map_or(0, Body::scans);
-            let done = format!("{seconds} of {} s, {scans} scans", self.run_for.as_secs_f64());
-            (self.progress)(Some(&done));
+            if let Some(is_shown) = &mut self.is_shown {
+                let _ = write!(
+                    self.notes,
+                    "\r\x1b[K{seconds} of {} s, {scans} scans ..",
+                    self.run_for.as_secs_f64()
+                );
+                *is_shown = true;
+            }
+        }
+    }
+
+    /// Removes the line of progress.
+    fn clear(&mut self) {
+        if self.is_shown == Some(true) {
+            let _ = write!(self.notes, "\r\x1b[K");
+            self.is_shown = Some(false);
         }
     }
 }

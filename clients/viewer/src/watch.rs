@@ -17,6 +17,7 @@ use scanhub_client::request;
 use scanhub_schema::{Background, Failure, Kind, Request, Topic, Verb, check_followed, is_remote};
 use scanhub_shm::Domain;
 use scanhub_verbs::Bounds;
+use scanhub_verbs::context::Context;
 use scanhub_verbs::follow::{Event, Following, Notice};
 use scanhub_verbs::names::as_word;
 use scanhub_verbs::output::{End, colors, quiet};
@@ -26,9 +27,9 @@ use crate::scene::Scene;
 use terminal::{Input, Key, Terminal};
 use view::{View, ViewCommand};
 
-/// Arguments of `watch`.
+/// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
 #[derive(Args, Clone, Debug, Default)]
-#[command(after_help = KEYS)]
+#[command(after_help = AFTER_HELP)]
 pub struct WatchArgs {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
@@ -37,7 +38,11 @@ pub struct WatchArgs {
     limits: Bounds,
 }
 
-const KEYS: &str = "\
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub watch
+  scanhub watch front
+
 Keys: q quits, ? lists the other keys. NO_COLOR=1 shows signs instead of colours. From another machine: ssh -t robot scanhub watch.";
 
 /// Minimum interval between two frames, so that a scan is on the screen within 50 ms.
@@ -48,7 +53,7 @@ const BYTES_PER_SECOND: f64 = 80_000.0;
 const MESSAGE_TIME: Duration = Duration::from_secs(4);
 
 impl WatchArgs {
-    /// Shows the picture of the first live domain of `places` on the terminal that `out` writes to, until the user
+    /// Shows the picture of the first live domain on the terminal, until the user
     /// quits, the limits are reached or `stop` is set.
     ///
     /// # Errors
@@ -57,20 +62,17 @@ impl WatchArgs {
     /// - [`Kind::Failed`] if the terminal cannot be used.
     /// - [`Kind::Interrupted`] if Ctrl-C ends a bounded run.
     /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] as for `echo`.
-    pub fn run(
-        &self,
-        places: &[Domain],
-        json: bool,
-        out: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        // Every signal that ends the run must restore the terminal.
+        let (places, stop) = (context.domain.places()?, context.signals.any_end()?);
+        let json = context.json;
         if json || !can_show_pictures() {
             let sensor = self.sensors.first().map_or("robot/zones".to_owned(), |name| format!("{name}/scan"));
             let hint = format!("lines for files and programs: scanhub echo {sensor}, with --json as objects");
             let what = if json { "a picture is no JSON" } else { "the picture needs a terminal" };
             return Err(Failure::new(Kind::Usage, what, hint));
         }
-        self.show("", places, out, stop)
+        self.show("", &places, &mut context.out, &stop)
     }
 
     /// Does the same as [`run`](Self::run) with a `note` next to the keys, and without checking for a terminal.

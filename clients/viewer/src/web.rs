@@ -31,9 +31,9 @@ use crate::server::player::Playback;
 use crate::server::{AccessPolicy, ChannelStore, Event, Server, ViewerEvent};
 use feed::Feed;
 
-/// Arguments of `web`.
+/// Serve the live picture to browsers, and to Foxglove and Lichtblick
 #[derive(Args, Clone, Debug)]
-#[command(after_help = VIEWERS)]
+#[command(after_help = AFTER_HELP)]
 pub struct WebArgs {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
@@ -67,7 +67,12 @@ pub struct WebArgs {
     limits: Bounds,
 }
 
-const VIEWERS: &str = "\
+const AFTER_HELP: &str = "\
+Examples:
+  scanhub web
+  scanhub web --listen 8090
+  scanhub web --listen 0.0.0.0 --token carrot
+
 Open the printed address in a browser. Foxglove and Lichtblick: open connection, Foxglove WebSocket, the same address with ws:.";
 
 /// Port if `--listen` names only an address.

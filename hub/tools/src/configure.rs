@@ -30,8 +30,9 @@ use crate::driver::{Procedure, drive};
 use crate::probe::{check_unused, hex, measuring, open, request_report, source};
 use crate::terminal::{Progress, print};
 
-/// Arguments of `configure`.
+/// Change a sensor's EEPROM settings: shows the difference and asks first
 #[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
 pub struct ConfigureArgs {
     /// Port of the sensor: a tty or tcp:HOST:PORT
     #[arg(value_name = "PORT")]
@@ -46,7 +47,11 @@ pub struct ConfigureArgs {
 }
 
 /// Text about the confirmation, for the end of the help.
-pub const CONSENT: &str = "A person must confirm. If stdin or stderr is not a terminal, the difference is \
+const AFTER_HELP: &str = "\
+Example:
+  scanhub configure /dev/ttyUSB0 unit=mm
+
+A person must confirm. If stdin or stderr is not a terminal, the difference is \
                            shown, nothing is written, and the exit code is 2";
 
 impl ConfigureArgs {

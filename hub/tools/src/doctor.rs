@@ -31,7 +31,7 @@ pub(crate) use hub::Hub;
 pub use installation::System;
 use machine::Facts;
 
-/// Arguments of `doctor`.
+/// Check the setup and show how to fix what is wrong
 #[derive(Args, Debug)]
 pub struct DoctorArgs {
     /// Ports to check: a tty or tcp:HOST:PORT, or the name of a link of the running hub; without one, the ports of the

@@ -26,8 +26,9 @@ use description::link_settings;
 use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 
-/// Arguments of `probe`.
+/// Show the sensor at a port; without a port, list the ports
 #[derive(Args, Debug)]
+#[command(after_help = EXAMPLES)]
 pub struct ProbeArgs {
     /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
     #[arg(value_name = "PORT")]
@@ -36,6 +37,12 @@ pub struct ProbeArgs {
     #[arg(long, requires = "port", conflicts_with = "json")]
     toml: bool,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  scanhub probe
+  scanhub probe /dev/ttyUSB0
+  scanhub probe /dev/ttyUSB0 --toml >> scanhub.toml";
 
 impl ProbeArgs {
     /// Prints the scanner at the port, or the ports of this machine without opening any. `places` returns the locations in

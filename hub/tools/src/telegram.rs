@@ -24,12 +24,18 @@ use serde::Serialize;
 
 use parser::{Item, StreamParser};
 
-/// Arguments of `telegram`.
+/// Explain telegrams field by field, or write them
 #[derive(Args, Debug)]
+#[command(after_help = EXAMPLES)]
 pub struct TelegramArgs {
     #[command(subcommand)]
     action: Action,
 }
+
+const EXAMPLES: &str = "\
+Examples:
+  scanhub telegram decode recording.bin
+  echo 02 00 01 00 31 15 12 | scanhub telegram decode";
 
 #[derive(Debug, Subcommand)]
 enum Action {
@@ -38,6 +44,7 @@ enum Action {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = EXAMPLES)]
 struct DecodeArgs {
     /// File with the bytes, raw or as text, or an MCAP recording; - or nothing is stdin
     file: Option<PathBuf>,

@@ -14,7 +14,7 @@ use crate::testkit::{Program, Sender, TestEnv, in_a_network, side_by_side, until
 use scanhub_schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
-/// program are read by `hub/cli/examples.rs`.
+/// program are read by `hub/cli.rs`.
 const NOT_RUN: [(&str, &str); 18] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),

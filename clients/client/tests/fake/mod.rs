@@ -2,10 +2,11 @@
 //! with the test.
 #![allow(dead_code)] // Every test file takes what it needs.
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -238,12 +239,13 @@ pub(crate) struct Verb {
 }
 
 impl Verb {
+    /// Starts `verb` with its standard output, its standard error and the flag that ends it.
     pub(crate) fn start(
-        verb: impl FnOnce(&mut dyn Write, &mut dyn Write, &AtomicBool) -> Result<(), Failure> + Send + 'static,
+        verb: impl FnOnce(File, File, Arc<AtomicBool>) -> Result<(), Failure> + Send + 'static,
     ) -> Verb {
-        let (out, notes, stop) = (Sink::default(), Sink::default(), Arc::new(AtomicBool::new(false)));
-        let (mut to, mut beside, flag) = (out.clone(), notes.clone(), stop.clone());
-        let thread = std::thread::spawn(move || verb(&mut to, &mut beside, &flag));
+        let (out, notes, stop) = (Sink::new(), Sink::new(), Arc::new(AtomicBool::new(false)));
+        let (to, beside, flag) = (out.file(), notes.file(), stop.clone());
+        let thread = std::thread::spawn(move || verb(to, beside, flag));
         Verb { out, notes, stop, thread }
     }
 
@@ -262,13 +264,23 @@ impl Verb {
     }
 }
 
-/// Bytes that were written, for another thread to look at.
-#[derive(Clone, Default)]
-pub(crate) struct Sink(Arc<Mutex<Vec<u8>>>);
+/// File without a name that a verb writes to. A test reads it at the same time.
+pub(crate) struct Sink(File);
 
 impl Sink {
+    pub(crate) fn new() -> Sink {
+        Sink(tempfile::tempfile().unwrap())
+    }
+
+    /// Returns the file for the verb. It writes at its end.
+    pub(crate) fn file(&self) -> File {
+        self.0.try_clone().unwrap()
+    }
+
     pub(crate) fn bytes(&self) -> Vec<u8> {
-        self.0.lock().unwrap().clone()
+        let mut bytes = vec![0; self.0.metadata().unwrap().len() as usize];
+        self.0.read_exact_at(&mut bytes, 0).unwrap();
+        bytes
     }
 
     pub(crate) fn text(&self) -> String {
@@ -278,17 +290,6 @@ impl Sink {
     /// Waits until `count` lines contain `text`.
     pub(crate) fn await_lines(&self, text: &str, count: usize) {
         until(text, || self.text().lines().filter(|line| line.contains(text)).count() >= count);
-    }
-}
-
-impl Write for Sink {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().unwrap().extend_from_slice(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
     }
 }
 

@@ -7,14 +7,16 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use scanhub_files::{output, regular};
 use scanhub_schema::{Failure, Kind, Printable};
+use scanhub_verbs::context::Context;
 use scanhub_verbs::output::{End, Output, quiet};
 use serde::Serialize;
 
 use crate::track::Site;
 use crate::track::geometry::{Point, middle};
 
-/// Arguments of `site`.
+/// Check and draw the plan of sensors, rooms and doors that people are followed in
 #[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  scanhub site check house.toml")]
 pub struct SiteArgs {
     #[command(subcommand)]
     command: SiteCommand,
@@ -23,6 +25,7 @@ pub struct SiteArgs {
 #[derive(Clone, Debug, Subcommand)]
 enum SiteCommand {
     /// Check a site file; if it has an error, show the place and exit with 78
+    #[command(after_help = "Example:\n  scanhub site check house.toml --svg house.svg")]
     Check {
         /// The site file: sensors, rooms and doors
         file: PathBuf,
@@ -54,7 +57,7 @@ impl SiteArgs {
     /// # Errors
     ///
     /// Returns the errors of [`Site::read`], and [`Kind::Failed`] if a file or the output cannot be written.
-    pub fn run(&self, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let SiteCommand::Check { file, svg, force } = &self.command;
         let site = Site::read(file)?;
         if let Some(svg) = svg {
@@ -71,8 +74,8 @@ impl SiteArgs {
             gaps: site.gaps.len(),
             ignored: site.ignored.iter().map(|area| area.name.as_str()).collect(),
         };
-        let mut out = Output::new(out);
-        quiet(if json { out.json(&plan) } else { plan.write(&mut out) })
+        let mut out = Output::new(&mut context.out);
+        quiet(if context.json { out.json(&plan) } else { plan.write(&mut out) })
     }
 }
 

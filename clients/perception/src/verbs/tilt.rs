@@ -1,7 +1,7 @@
 //! `scanhub tilt`: computes three dimensions with a scanner on a mount, and prints and publishes points and obstacles.
 
 use std::io::{self, Write};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use clap::Args;
@@ -9,6 +9,7 @@ use scanhub_client::streams::Sample;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Cloud, CloudHead, CloudPoint, Failure, Header, Kind, Obstacles, Topic, Wake};
 use scanhub_shm::Domain;
+use scanhub_verbs::context::Context;
 use scanhub_verbs::follow::{Bounds, Event, Following};
 use scanhub_verbs::names::TopicName;
 use scanhub_verbs::output::{End, quiet};
@@ -19,8 +20,9 @@ use super::own_name;
 use super::results::{Results, Topics};
 use crate::tilt::{Angle, Check, Counts, Mount, Point, Settings, Sweep, TiltScanner, Withheld};
 
-/// Arguments of `tilt`.
+/// 3D from a tilting scanner: points, background, obstacles
 #[derive(Args, Clone, Debug)]
+#[command(after_help = EXAMPLES)]
 pub struct TiltArgs {
     /// The scanner
     #[arg(value_name = "SENSOR")]
@@ -66,6 +68,11 @@ pub struct TiltArgs {
     timeout: Option<Duration>,
 }
 
+const EXAMPLES: &str = "\
+Examples:
+  scanhub tilt front --angles mount --axis-at 0,0,0.9 --as hall
+  scanhub tilt front --angles mount --axis-at 0,0,0.9 --near 0.3,1.2,-0.5,0.5,0.05,1.6";
+
 fn number(text: &str) -> Result<f64, String> {
     let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
     number.ok_or_else(|| format!("{text:?} is not a number"))
@@ -109,14 +116,8 @@ impl TiltArgs {
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run or a check ended.
     /// - [`Kind::Check`] if a check has failed.
     /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let names = [(&self.sensor, Topic::Scan), (&self.angles, Topic::Tilt)]
             .map(|(sensor, topic)| TopicName { sensor: sensor.clone(), topic });
         let mount = Mount {
@@ -132,20 +133,20 @@ impl TiltArgs {
         let name = self.name.as_deref().unwrap_or(UNNAMED);
         let mut run = TiltRun {
             args: self,
-            places,
+            places: &places,
             scanner: TiltScanner::new(mount, settings),
             problem: ProblemFilter::default(),
             late_ns: 0,
             check: self.check.then(Check::default),
             beams: None,
             writer: SweepWriter {
-                results: Results::new(name, json, out, notes),
+                results: Results::new(name, context.json, &mut context.out, &mut context.notes),
                 to_wall_ns: 0,
                 obstacles: Box::default(),
                 written: Ok(()),
             },
         };
-        let followed = run.follow(&mut Following::new(&names, &[], places, &bounds, stop));
+        let followed = run.follow(&mut Following::new(&names, &[], &places, &bounds, &stop));
         let TiltRun { check: Some(check), writer, .. } = &mut run else { return quiet(followed) };
         if check.sweeps() < CHECKED_SWEEPS {
             quiet(followed)?;

@@ -2,7 +2,6 @@
 
 use std::io::{self, Write};
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -11,6 +10,7 @@ use scanhub_client::streams::{Join, Sample};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Event, Failure, Foreground, Header, Kind, Scan, Topic, Tracks, Wake};
 use scanhub_shm::Domain;
+use scanhub_verbs::context::Context;
 use scanhub_verbs::follow::{self, Bounds, Following};
 use scanhub_verbs::names::TopicName;
 use scanhub_verbs::output::{End, quiet};
@@ -21,8 +21,9 @@ use super::own_name;
 use super::results::{Results, Topics};
 use crate::track::{self, Counts, Misplaced, PICTURE_NS, PeopleTracker, Picture, Site};
 
-/// Arguments of `track`.
+/// Follow people across the sensors and rooms of a site, and count them at doors
 #[derive(Args, Clone, Debug)]
+#[command(after_help = EXAMPLES)]
 pub struct TrackArgs {
     /// The site file: sensors, rooms and doors
     #[arg(long, value_name = "FILE")]
@@ -44,6 +45,11 @@ pub struct TrackArgs {
     timeout: Option<Duration>,
 }
 
+const EXAMPLES: &str = "\
+Examples:
+  scanhub track --site house.toml
+  scanhub track --site house.toml --count left";
+
 impl TrackArgs {
     /// Subscribes to the scans and foregrounds of the site's sensors in the first live domain of `places`. Writes tracks and
     /// events to `out`, or only the counts of some doors. Without `json`, notices go to `notes` (stderr). Ends at the limits,
@@ -57,14 +63,8 @@ impl TrackArgs {
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
     /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
     /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
-    pub fn run(
-        &self,
-        json: bool,
-        places: &[Domain],
-        out: &mut dyn Write,
-        notes: &mut dyn Write,
-        stop: &AtomicBool,
-    ) -> Result<(), Failure> {
+    pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
+        let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let site = Site::read(&self.site)?;
         let counted = self.count.iter().map(|name| door(&site, name)).collect::<Result<_, _>>()?;
         let topics = |sensor: &track::site::Sensor| {
@@ -73,11 +73,11 @@ impl TrackArgs {
         let names: Vec<TopicName> = site.sensors.iter().flat_map(topics).collect();
         let bounds = Bounds { count: None, run_for: self.run_for, timeout: self.timeout };
         let name = self.name.as_deref().unwrap_or(UNNAMED);
-        let mut results = Results::new(name, json, out, notes);
+        let mut results = Results::new(name, context.json, &mut context.out, &mut context.notes);
         results.header.period_us = (PICTURE_NS / 1000) as u32;
         let mut run = TrackRun {
             args: self,
-            places,
+            places: &places,
             tracker: PeopleTracker::new(
                 site.clone(),
                 u64::try_from(self.delay.as_nanos()).unwrap_or(u64::MAX),
@@ -95,7 +95,7 @@ impl TrackArgs {
                 results,
             },
         };
-        quiet(run.follow(&mut Following::new(&names, &[], places, &bounds, stop)))
+        quiet(run.follow(&mut Following::new(&names, &[], &places, &bounds, &stop)))
     }
 }
 

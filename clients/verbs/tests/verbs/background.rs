@@ -8,11 +8,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use crate::fake::Place;
+use crate::fake::{Place, Sink};
+use crate::{context, named};
 use scanhub_schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb, as_json};
 use scanhub_shm::ControlServer;
 use scanhub_shm::{Domain, HubLock};
-use scanhub_verbs::{BackgroundArgs, ModelOrder, saved_model};
+use scanhub_verbs::background::{BackgroundArgs, ModelOrder, saved_model};
 
 /// A hub that answers for the background of `front`.
 struct Keeper {
@@ -104,9 +105,9 @@ fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
 
 fn ask(place: &Place, sensor: &str, order: ModelOrder, json: bool) -> (Result<(), Failure>, String) {
     let args = BackgroundArgs { sensor: sensor.into(), order };
-    let mut out = Vec::new();
-    let end = args.run(json, &place.places(), &mut &b""[..], &mut out, || Ok(Arc::default()));
-    (end, String::from_utf8(out).unwrap())
+    let (out, notes) = (Sink::new(), Sink::new());
+    let end = args.run(&mut context(named(place), json, out.file(), notes.file(), Arc::default()));
+    (end, out.text())
 }
 
 /// To save a model where nothing is yet.

@@ -1,14 +1,18 @@
 //! `echo` to the letter: lines, notices, bounds and ends.
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::io;
+use std::os::fd::OwnedFd;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
+use crate::{context, named};
 use scanhub_schema::{Counter, Flags, Kind, Topic, Verdict};
+use scanhub_verbs::Bounds;
+use scanhub_verbs::echo::EchoArgs;
 use scanhub_verbs::follow::{Event, Following};
 use scanhub_verbs::names::TopicName;
-use scanhub_verbs::{Bounds, EchoArgs};
 
 const ANSWER: [u8; 9] = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
 
@@ -31,8 +35,9 @@ fn args(topics: &[&str], format: &Format, bounds: Bounds) -> EchoArgs {
 }
 
 pub(crate) fn start(place: &Place, topics: &[&str], format: Format, bounds: Bounds) -> Verb {
-    let (args, places) = (args(topics, &format, bounds), place.places());
-    Verb::start(move |out, notes, stop| args.run(format == Format::Json, &places, out, notes, stop))
+    let (args, domain) = (args(topics, &format, bounds), named(place));
+    let json = format == Format::Json;
+    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
 fn count(count: u64) -> Bounds {
@@ -257,26 +262,15 @@ fn what_the_hub_does_not_have() {
     }
 }
 
-/// A pipe whose reader went away.
-struct Closed;
-
-impl Write for Closed {
-    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
-        Err(io::ErrorKind::BrokenPipe.into())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
 #[test]
 fn a_reader_that_goes_away_is_a_quiet_end() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let (args, places) = (args(&["front/scan"], &Format::Json, count(5)), place.places());
-    let verb =
-        Verb::start(move |_, notes, _| args.run(true, &places, &mut Closed, notes, &AtomicBool::new(false)));
+    let (args, domain) = (args(&["front/scan"], &Format::Json, count(5)), named(&place));
+    let (reader, pipe) = io::pipe().unwrap();
+    drop(reader);
+    let out = File::from(OwnedFd::from(pipe));
+    let verb = Verb::start(move |_, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
     hub.front().scan.await_subscribers(1);
     hub.front().scan(&[1]);
     assert_eq!(verb.join().0, Ok(()));

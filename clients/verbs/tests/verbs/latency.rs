@@ -4,17 +4,22 @@ use std::time::Duration;
 
 use clap::{Args, Command, FromArgMatches};
 use scanhub_schema::{Failure, Kind, Verdict};
-use scanhub_verbs::LatencyArgs;
+use scanhub_verbs::context::Context;
+use scanhub_verbs::latency::LatencyArgs;
 
 use crate::fake::{FakeHub, Place, Verb};
+use crate::{context, named};
 
 /// Runs `latency` with these arguments and without real-time priority.
 fn start(place: &Place, is_json: bool, arguments: &str) -> Verb {
     let command = LatencyArgs::augment_args(Command::new("latency").no_binary_name(true));
     let words = arguments.split(' ').chain(["--no-realtime"]);
     let args = LatencyArgs::from_arg_matches(&command.get_matches_from(words)).expect("arguments");
-    let places = place.places();
-    Verb::start(move |out, notes, stop| args.run(is_json, true, &places, out, notes, stop))
+    let domain = named(place);
+    Verb::start(move |out, notes, stop| {
+        let context = context(domain, is_json, out, notes, stop);
+        args.run(&mut Context { is_terminal: true, ..context })
+    })
 }
 
 /// Three zones, stamped when they are sent, to a consumer that listens.

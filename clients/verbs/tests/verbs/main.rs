@@ -12,3 +12,21 @@ mod latency;
 mod restart;
 mod verbs;
 mod zones;
+
+use std::fs::File;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use scanhub_verbs::context::{Context, DomainOptions};
+
+use fake::Place;
+
+/// Returns the domain of `place` as a user would name it.
+fn named(place: &Place) -> DomainOptions {
+    DomainOptions { name: place.domain.name().to_owned(), root: Some(place.base.clone()) }
+}
+
+/// Returns what a verb gets that writes to `out` and `notes` until `stop` is set.
+fn context(domain: DomainOptions, json: bool, out: File, notes: File, stop: Arc<AtomicBool>) -> Context {
+    Context::new(json, domain, (out, notes), Box::new(stop))
+}

@@ -1,23 +1,27 @@
 //! `list`, `info` and `hz` with a hub and without one.
 
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
+use crate::{context, named};
 use scanhub_schema::{Counter, Kind, Pose};
-use scanhub_shm::DEFAULT_DOMAIN;
-use scanhub_verbs::{Bounds, HzArgs, InfoArgs, ListArgs};
+use scanhub_verbs::Bounds;
+use scanhub_verbs::hz::HzArgs;
+use scanhub_verbs::info::InfoArgs;
+use scanhub_verbs::list::ListArgs;
 
 fn start_list(place: &Place, json: bool) -> Verb {
-    let (domain, base) = (place.domain.name().to_owned(), place.base.clone());
-    let interrupt = || Ok(Arc::new(AtomicBool::new(false)));
-    Verb::start(move |out, _, _| ListArgs { domains: false }.run(json, &domain, Some(&base), out, interrupt))
+    list(place, ListArgs { domains: false }, json)
+}
+
+fn list(place: &Place, args: ListArgs, json: bool) -> Verb {
+    let domain = named(place);
+    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
 fn start_info(place: &Place, sensor: Option<&str>, json: bool) -> Verb {
-    let (args, places) = (InfoArgs { sensor: sensor.map(Into::into) }, place.places());
-    Verb::start(move |out, _, stop| args.run(json, &places, out, stop))
+    let (args, domain) = (InfoArgs { sensor: sensor.map(Into::into) }, named(place));
+    Verb::start(move |out, notes, stop| args.run(&mut context(domain, json, out, notes, stop)))
 }
 
 #[test]
@@ -66,11 +70,9 @@ fn topics_of_a_hub() {
 fn live_domains() {
     let place = Place::new();
     let list = || {
-        let mut out = Vec::new();
-        let args = ListArgs { domains: true };
-        let interrupt = || Ok(Arc::new(AtomicBool::new(false)));
-        args.run(true, DEFAULT_DOMAIN, Some(&place.base), &mut out, interrupt).unwrap();
-        String::from_utf8(out).unwrap()
+        let (end, out, _) = list(&place, ListArgs { domains: true }, true).join();
+        assert_eq!(end, Ok(()));
+        out
     };
     assert_eq!(list(), "");
     let _hub = FakeHub::new(&place.domain, &[], 1);
@@ -123,10 +125,10 @@ fn rates_of_all_topics() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let args = HzArgs { topics: Vec::new(), window: Duration::from_secs(10), bounds: Bounds::default() };
-    let places = place.places();
+    let domain = named(&place);
     // Statuses from before anybody followed them wait for whoever comes.
     hub.front().status(|_| {});
-    let verb = Verb::start(move |out, notes, stop| args.run(true, &places, out, notes, stop));
+    let verb = Verb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
     hub.front().scan.await_subscribers(1);
     // It follows the state of the line, too.
     hub.front().status.await_subscribers(2);

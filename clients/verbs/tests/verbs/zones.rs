@@ -4,9 +4,11 @@ use std::time::{Duration, Instant};
 
 use crate::echo::{Format, start};
 use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
+use crate::{context, named};
 use scanhub_client::{RobotFollower, ZonesFollower};
 use scanhub_schema::{Kind, Verdict};
-use scanhub_verbs::{Bounds, HzArgs};
+use scanhub_verbs::Bounds;
+use scanhub_verbs::hz::HzArgs;
 
 /// Slow scans, so that a busy machine is no silence: two of them and 40 ms are.
 const PERIOD_US: u32 = 300_000;
@@ -96,8 +98,8 @@ fn echo_says_the_silence_too() {
         window: Duration::from_secs(10),
         bounds: Bounds::default(),
     };
-    let places = place.places();
-    let rate = Verb::start(move |out, notes, stop| args.run(true, &places, out, notes, stop));
+    let domain = named(&place);
+    let rate = Verb::start(move |out, notes, stop| args.run(&mut context(domain, true, out, notes, stop)));
     hub.front().zones.await_subscribers(4);
     hub.front().zones(Verdict::Stop, 420);
     verbs[0].out.await_lines(r#""stale":true"#, 1);

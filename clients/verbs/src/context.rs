@@ -1,0 +1,104 @@
+//! The parts of the process that a verb uses: its output, the domain that the user named, and signals.
+
+use std::fs::File;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use scanhub_schema::Failure;
+use scanhub_shm::{Domain, Environment};
+
+/// The parts of the process that a verb uses. The program creates one for the verb that it runs.
+pub struct Context {
+    /// Whether to print one JSON object per line.
+    pub json: bool,
+    /// The domain that the user named.
+    pub domain: DomainOptions,
+    /// Standard output. It has no buffer, so each write is one line or one raw sample.
+    pub out: File,
+    /// Whether `out` is a terminal, where a line may be redrawn.
+    pub is_terminal: bool,
+    /// Standard error, for notices that are not part of the output.
+    pub notes: File,
+    /// Signals of the process.
+    pub signals: Box<dyn Signals>,
+}
+
+impl Context {
+    /// Creates the context of a process that has these files as standard output and standard error.
+    pub fn new(
+        json: bool,
+        domain: DomainOptions,
+        (out, notes): (File, File),
+        signals: Box<dyn Signals>,
+    ) -> Context {
+        let is_terminal = out.is_terminal();
+        Context { json, domain, out, is_terminal, notes, signals }
+    }
+}
+
+/// Options that name a domain.
+#[derive(Clone, Debug)]
+pub struct DomainOptions {
+    /// Name of the domain.
+    pub name: String,
+    /// Directory of the hub, if it is not at one of the usual locations.
+    pub root: Option<PathBuf>,
+}
+
+impl DomainOptions {
+    /// Returns the locations in which a client searches for the domain.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`](scanhub_schema::Kind) if the name is not valid.
+    pub fn places(&self) -> Result<Vec<Domain>, Failure> {
+        Domain::candidates(&self.name, self.root.as_deref(), &Environment::of_process())
+    }
+
+    /// Returns the domain in which a hub publishes.
+    ///
+    /// # Errors
+    ///
+    /// As for [`places`](Self::places).
+    pub fn of_hub(&self) -> Result<Domain, Failure> {
+        Domain::of_hub(&self.name, self.root.as_deref(), &Environment::of_process())
+    }
+
+    /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
+    ///
+    /// # Errors
+    ///
+    /// As for [`places`](Self::places).
+    pub fn of_publisher(&self) -> Result<Domain, Failure> {
+        scanhub_shm::publisher_domain(&self.name, self.root.as_deref(), &Environment::of_process())
+    }
+}
+
+/// Signals that a verb handles. Each function installs a handler that sets the returned flag; the signals do not end the process
+/// any more. It fails if a handler cannot be installed.
+pub trait Signals {
+    /// Returns a flag for SIGINT and SIGTERM.
+    fn stop(&self) -> Result<Arc<AtomicBool>, Failure>;
+    /// Returns a flag for all signals that ask a process to end, including those of a terminal that is closed. A verb uses it if
+    /// it must restore or finish something in any case.
+    fn any_end(&self) -> Result<Arc<AtomicBool>, Failure>;
+    /// Returns a flag for SIGUSR1, which requests a report.
+    fn report(&self) -> Result<Arc<AtomicBool>, Failure>;
+}
+
+/// One flag in place of the signals that end a process, for a program that runs a verb in a thread. It never requests a report.
+impl Signals for Arc<AtomicBool> {
+    fn stop(&self) -> Result<Arc<AtomicBool>, Failure> {
+        Ok(self.clone())
+    }
+
+    fn any_end(&self) -> Result<Arc<AtomicBool>, Failure> {
+        Ok(self.clone())
+    }
+
+    fn report(&self) -> Result<Arc<AtomicBool>, Failure> {
+        Ok(Arc::default())
+    }
+}
