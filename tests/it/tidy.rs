@@ -9,6 +9,7 @@ mod keys;
 mod sources;
 mod topics;
 mod tree;
+mod verbs;
 mod within;
 mod written;
 
