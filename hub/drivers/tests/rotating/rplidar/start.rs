@@ -323,7 +323,7 @@ fn spinning_up(model: Model) -> Bench {
 }
 
 #[test]
-fn another_scanner_whose_stream_begins_during_the_spin_up_is_identified() {
+fn identifies_a_scanner_that_streams_during_the_spin_up() {
     // Packets of another kind, and packets of the same kind with another time per point.
     for (before, model) in [(Model::S1, Model::A3), (Model::A3, Model::S1), (Model::A1, Model::A2m8)] {
         let mut bench = spinning_up(before);
@@ -344,7 +344,7 @@ fn another_scanner_whose_stream_begins_during_the_spin_up_is_identified() {
 }
 
 #[test]
-fn a_stream_that_is_announced_twice_is_one_stream() {
+fn accepts_a_stream_that_is_announced_twice() {
     let mut bench = spinning_up(Model::A1);
     let kind = bench.head.kind().expect("measuring");
     bench.head.answer(answer_of(kind), 0x40, &[kind.bytes() as u8], bench.now + 70 * MILLIS);
