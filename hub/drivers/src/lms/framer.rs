@@ -13,7 +13,7 @@ use scanhub_schema::{MILLIS, Nanos};
 use crate::line::suspect;
 use crate::lms::header::{Expect, HEADER_DISTANCE, Judgement, MAX_HEADER, Reject, State, judge};
 use crate::lms::measured::MEASURED;
-use crate::lms::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
+use crate::lms::telegram::{ACK, Checksum, MAX_TELEGRAM, NAK, STX, Telegram};
 
 /// What became of the bytes; every field only grows.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -101,6 +101,8 @@ pub struct Framer {
     live: Candidates,
     /// A frame with a right checksum that waits for a header inside it.
     held: Option<Held>,
+    /// Checksum of a candidate that is arriving, and the number of its first byte.
+    arriving: (u64, Checksum),
     expect: Expect,
     awaits_acknowledge: bool,
     /// Bytes were discarded since the last telegram.
@@ -124,6 +126,7 @@ impl Default for Framer {
             cursor: 0,
             live: Candidates::new(),
             held: None,
+            arriving: (0, Checksum::default()),
             expect: Expect::Anything,
             awaits_acknowledge: false,
             damage: false,
@@ -191,6 +194,7 @@ impl Framer {
                 self.complete(candidate);
                 continue;
             }
+            self.add_arrived();
             if let Some(held) = self.held {
                 self.give_up_before(held);
                 return None;
@@ -249,8 +253,7 @@ impl Framer {
         let live = || self.live.first().map(|candidate| (candidate.at.into(), candidate.end.into()));
         let (at, end): (usize, usize) = held.or_else(live)?;
         let reasons = if self.damage || at > self.start { suspect::NEIGHBOUR } else { 0 };
-        let offset = self.tally.read - (self.end - at) as u64;
-        Some(Begun { bytes: &self.buffer[at..end.min(self.end)], offset, reasons })
+        Some(Begun { bytes: &self.buffer[at..end.min(self.end)], offset: self.offset(at), reasons })
     }
 
     /// What became of the bytes.
@@ -263,8 +266,13 @@ impl Framer {
         self.end - self.start
     }
 
+    /// Returns the number of the byte at `at` among all bytes committed, from 0.
+    fn offset(&self, at: usize) -> u64 {
+        self.tally.read - (self.end - at) as u64
+    }
+
     fn judge_headers(&mut self) {
-        while let Some(found) = self.buffer[self.cursor..self.end].iter().position(|&byte| byte == STX) {
+        while let Some(found) = find_stx(&self.buffer[self.cursor..self.end]) {
             let at = self.cursor + found;
             let header = &self.buffer[at..self.end.min(at + MAX_HEADER)];
             match judge(header, &self.expect) {
@@ -280,11 +288,28 @@ impl Framer {
         self.cursor = self.end.max(self.cursor);
     }
 
+    /// Adds the bytes that have arrived to the checksum of the first candidate, so that little is left to do after its last
+    /// byte.
+    fn add_arrived(&mut self) {
+        if let Some(first) = self.live.first() {
+            let (at, end) = (usize::from(first.at), usize::from(first.end));
+            let mut checksum = self.checksum(at);
+            checksum.extend(&self.buffer[at..self.end.min(end - 2)]);
+            self.arriving = (self.offset(at), checksum);
+        }
+    }
+
+    /// Returns the checksum of the candidate at `at`, which may already include some of its bytes.
+    fn checksum(&self, at: usize) -> Checksum {
+        let (offset, checksum) = self.arriving;
+        if offset == self.offset(at) { checksum } else { Checksum::default() }
+    }
+
     /// Looks at the checksum of the earliest complete candidate: a wrong one ends it, a right one ends those that
     /// began before it and the held frame that it began in.
     fn complete(&mut self, candidate: Candidate) {
         let (at, end) = (usize::from(candidate.at), usize::from(candidate.end));
-        let right = Telegram::check(&self.buffer[at..end]).is_some();
+        let right = Telegram::check_rest(&self.buffer[at..end], self.checksum(at)).is_some();
         match &mut self.held {
             // What began inside the held frame reaches into this telegram, so it is none.
             Some(held) if right && held.end <= at => return self.refute_headers_inside(),
@@ -317,8 +342,7 @@ impl Framer {
         let damage = core::mem::take(&mut self.damage) && self.tally.telegrams > 1;
         let reasons = if damage { suspect::NEIGHBOUR } else { 0 }
             | if header_inside { suspect::HEADER_INSIDE } else { 0 };
-        let offset = self.tally.read - (self.end - at) as u64;
-        TelegramSpan { at, end, offset, reasons }
+        TelegramSpan { at, end, offset: self.offset(at), reasons }
     }
 
     /// Whatever becomes of `held`, what came before it is in nothing.
@@ -380,6 +404,13 @@ impl Framer {
             held.end -= by;
         }
     }
+}
+
+/// Returns the index of the first STX. A block without one is skipped by a single vector comparison.
+fn find_stx(bytes: &[u8]) -> Option<usize> {
+    let is_empty = |block: &&[u8; 16]| !block.iter().fold(false, |any, &byte| any | (byte == STX));
+    let skipped = 16 * bytes.as_chunks().0.iter().take_while(is_empty).count();
+    bytes[skipped..].iter().position(|&byte| byte == STX).map(|at| skipped + at)
 }
 
 /// A held frame and a header that begins with its last byte must fit.

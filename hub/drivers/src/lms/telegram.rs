@@ -27,11 +27,16 @@ pub struct Telegram<'a>(&'a [u8]);
 impl<'a> Telegram<'a> {
     /// The telegram that `bytes` are, from STX to the second checksum byte; `None` if they are not exactly one.
     pub fn check(bytes: &'a [u8]) -> Option<Self> {
+        Telegram::check_rest(bytes, Checksum::default())
+    }
+
+    /// Checks `bytes` like [`Telegram::check`]. `checksum` already includes the first ones.
+    pub(crate) fn check_rest(bytes: &'a [u8], checksum: Checksum) -> Option<Self> {
         let [STX, _, low, high, _, .., crc_low, crc_high] = *bytes else { return None };
         let length = usize::from(u16::from_le_bytes([low, high]));
         let whole = (1..=MAX_LENGTH).contains(&length) && bytes.len() == length + FRAME;
         let (covered, _) = bytes.split_at(bytes.len() - 2);
-        (whole && crc(covered) == u16::from_le_bytes([crc_low, crc_high])).then_some(Telegram(bytes))
+        (whole && checksum.of(covered) == u16::from_le_bytes([crc_low, crc_high])).then_some(Telegram(bytes))
     }
 
     /// The telegram in bytes that [`Telegram::check`] has seen before.
@@ -174,21 +179,58 @@ impl fmt::Debug for Encoded {
     }
 }
 
-/// Polynomial x^16 + x^15 + x^2 + 1 without its top term (Telegram listing 4, checked against 54 printed telegrams).
-const POLYNOMIAL: u16 = 0x8005;
-
-/// Checksum over `bytes`, STX up to and including the last byte before the checksum itself. It is sent low byte
-/// first.
+/// Returns the checksum of `bytes`, from STX to the last byte before the checksum. It is sent low byte first.
 pub fn crc(bytes: &[u8]) -> u16 {
-    let mut crc = 0u16;
-    let mut previous = 0u8;
-    for &byte in bytes {
-        // All ones where the bit about to be shifted out is set: no branch that real data could mispredict.
-        let carry = ((crc as i16) >> 15) as u16;
-        crc = (crc << 1) ^ u16::from_le_bytes([byte, previous]) ^ (carry & POLYNOMIAL);
-        previous = byte;
+    Checksum::default().of(bytes)
+}
+
+/// Checksum of a telegram that is arriving.
+///
+/// The manual defines it byte by byte: `crc = crc * x + previous * x^8 + byte`, modulo x^16 + x^15 + x^2 + 1 over GF(2)
+/// (Telegram listing 4, checked against 54 printed telegrams). The sum S of all bytes, each multiplied by x for every
+/// byte after it, is simpler. `crc = S + (S + last byte) * x^7`, and eight bytes are added to S at once.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Checksum {
+    /// Number of bytes in the sum, a multiple of 8.
+    len: usize,
+    sum: u16,
+}
+
+impl Checksum {
+    /// Adds `bytes`, the first bytes of the telegram, except those that are already included. Up to seven bytes are left
+    /// for the next call.
+    pub(crate) fn extend(&mut self, bytes: &[u8]) {
+        let (words, _) = bytes[self.len..].as_chunks();
+        self.sum = words.iter().fold(self.sum, |sum, &word| times_x(sum, 8) ^ polynomial(word));
+        self.len += 8 * words.len();
     }
-    crc
+
+    /// Returns the checksum of `bytes`, which begin with the bytes that are already included.
+    fn of(mut self, bytes: &[u8]) -> u16 {
+        self.extend(bytes);
+        let rest = &bytes[self.len..];
+        let sum = rest.iter().fold(self.sum, |sum, &byte| times_x(sum, 1) ^ u16::from(byte));
+        sum ^ times_x(sum ^ bytes.last().map_or(0, |&byte| byte.into()), 7)
+    }
+}
+
+/// Returns `sum * x^power`; `power` is at most 8. If a polynomial h has an even number of terms, `h * x^16` is
+/// `h * (x^2 + x)`. Otherwise, it is greater by x^15 + x + 1.
+#[inline]
+fn times_x(sum: u16, power: u32) -> u16 {
+    let high = sum >> (16 - power);
+    let odd = (high.count_ones() as u16 & 1).wrapping_neg();
+    (sum << power) ^ (high << 2) ^ (high << 1) ^ (odd & 0x8003)
+}
+
+/// Returns the sum of eight bytes, the first one multiplied by x^7 and the last one by 1.
+#[inline]
+fn polynomial(bytes: [u8; 8]) -> u16 {
+    const LOW: u64 = 0x00FF_00FF_00FF_00FF;
+    let word = u64::from_be_bytes(bytes);
+    let pairs = ((word >> 8 & LOW) << 1) ^ (word & LOW);
+    let fours = (pairs >> 14) ^ pairs;
+    ((fours >> 28) ^ fours) as u16
 }
 
 #[cfg(test)]
@@ -227,5 +269,29 @@ mod tests {
         assert_eq!(crc(&[0x02, 0x81, 0x03, 0x00, 0xA0, 0x00, 0x10]), 0x1A36);
         assert_eq!(crc(b"\x02\x00\x0A\x00\x20\x00SICK_LMS"), 0xC5BE);
         assert_eq!(crc(&[]), 0);
+    }
+
+    /// The checksum as the manual defines it.
+    fn manual_crc(bytes: &[u8]) -> u16 {
+        let step = |(crc, previous): (u16, u8), &byte: &u8| {
+            let carry = if crc & 0x8000 == 0 { 0 } else { 0x8005 };
+            ((crc << 1) ^ carry ^ u16::from_le_bytes([byte, previous]), byte)
+        };
+        bytes.iter().fold((0, 0), step).0
+    }
+
+    #[test]
+    fn checksum_is_that_of_the_manual_however_bytes_arrive() {
+        let mut random = fastrand::Rng::with_seed(1);
+        for len in 0..MAX_TELEGRAM {
+            let bytes: Vec<u8> = core::iter::repeat_with(|| random.u8(..)).take(len).collect();
+            let mut checksum = Checksum::default();
+            let mut arrived = 0;
+            while arrived < len {
+                arrived = len.min(arrived + random.usize(1..100));
+                checksum.extend(&bytes[..arrived]);
+            }
+            assert_eq!([crc(&bytes), checksum.of(&bytes)], [manual_crc(&bytes); 2], "{len} bytes");
+        }
     }
 }
