@@ -1,0 +1,251 @@
+//! Measures what the hub executes for one telegram. Counts instructions, code lines of 64 bytes, code pages of 4 KiB and
+//! system calls of a link's thread, by single steps under ptrace, with one subscriber that waits for scans. The figures
+//! hardly depend on the machine's load, unlike those of `hub_load`. The bench does not measure time.
+//!
+//! The sensor sends at 9,600 baud, so that the steps keep up. Two costs would therefore be too high and are left out:
+//! repeated waits ([`steps::Cost`]), and the status, which is published once a second and thus with every other
+//! telegram. Its stage is still shown. Without symbols, all figures contain the status.
+//!
+//! The background is measured while it is being learned, and after it was. Another hub learns it at 500,000 baud, and
+//! the measured one starts with the saved model.
+//!
+//! Stages, crates and functions need the symbols of the program, which `cargo bench` strips:
+//!
+//! ```text
+//! CARGO_PROFILE_BENCH_STRIP=none CARGO_PROFILE_RELEASE_STRIP=none cargo bench --bench path
+//! ```
+#![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
+
+#[cfg(target_arch = "x86_64")]
+mod profile;
+#[cfg(target_arch = "x86_64")]
+#[path = "../../tests/testkit/steps.rs"]
+mod steps;
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn measure(_: &support::Options) -> support::Outcome<()> {
+    println!("path: skipped: single steps are implemented for x86-64 only");
+    Ok(())
+}
+
+#[cfg(target_arch = "x86_64")]
+use on_x86_64::measure;
+
+#[cfg(target_arch = "x86_64")]
+mod on_x86_64 {
+    use std::collections::{BTreeMap, HashMap};
+    use std::fs;
+    use std::path::{Path, PathBuf};
+    use std::process::Stdio;
+    use std::thread;
+    use std::time::{Duration, Instant};
+
+    use crate::profile::{self, Code, Profile, Sum};
+    use crate::steps::Stepper;
+    use crate::support::figures::{self, Cell};
+    use crate::support::stage::{Child, PATIENCE, PROGRAM, Stage};
+    use crate::support::{Options, Outcome};
+
+    pub(crate) fn measure(options: &Options) -> Outcome<()> {
+        let count = options.count(if options.quick { 10 } else { 100 });
+        let mut cells = Vec::new();
+        for background in ["learned", "not learned"] {
+            let stage = Stage::new()?;
+            let flags = ["--baud", "500000", "--state", "streaming", "--lossless"];
+            let _simulator = stage.simulate_as(&[SENSOR], &flags)?;
+            if background == "learned" {
+                learn(&stage)?;
+            }
+            let mut command = stage.hub_command(PROGRAM, &[SENSOR]);
+            command.arg(format!("--set=link.{SENSOR}.baud=9600"));
+            let hub = Child::of(command, Stdio::null())?;
+            hub.await_line("ready", PATIENCE)?;
+            let subscriber = stage.consumer("scan", SENSOR, &[])?;
+            subscriber.await_line("scan", 2 * PATIENCE)?;
+            let mut stepper = match Stepper::attach(link_thread(hub.guard.pid())?) {
+                Ok(stepper) => stepper,
+                Err(reason) => {
+                    println!("path: skipped: {reason}");
+                    return Ok(());
+                }
+            };
+            let code = Code::of(hub.guard.pid())?;
+            if !code.has_names() {
+                eprintln!(
+                    "path: no stages, crates and functions: the program has no symbols, or `nm` is missing; \
+                     set CARGO_PROFILE_BENCH_STRIP=none and CARGO_PROFILE_RELEASE_STRIP=none"
+                );
+            }
+            let (profile, calls) = step(&mut stepper, &code, count)?;
+            stepper.detach();
+            show(background, &profile, &calls, code.has_names(), &mut cells);
+        }
+        figures::print_cells("path", options.json, &cells);
+        Ok(())
+    }
+
+    /// Lets a hub learn the background and save it.
+    fn learn(stage: &Stage) -> Outcome<()> {
+        let hub = stage.hub(&[SENSOR])?;
+        hub.await_line("ready", PATIENCE)?;
+        let end = Instant::now() + 6 * PATIENCE;
+        while saved_background(&stage.file("scanhub")).is_none() {
+            if Instant::now() > end {
+                return Err("the hub did not learn the background".into());
+            }
+            thread::sleep(Duration::from_millis(100));
+        }
+        Ok(())
+    }
+
+    /// Returns the path of the background that a hub has saved below `directory`.
+    fn saved_background(directory: &Path) -> Option<PathBuf> {
+        let domains = fs::read_dir(directory).ok()?.flatten();
+        let files = domains.map(|domain| domain.path().join(format!("{SENSOR}.background.json")));
+        files.into_iter().find(|file| file.exists())
+    }
+
+    /// Returns the ID of the thread of the link, which has the sensor's name.
+    fn link_thread(pid: u32) -> Outcome<i32> {
+        for task in fs::read_dir(format!("/proc/{pid}/task"))? {
+            let task = task?;
+            if fs::read_to_string(task.path().join("comm"))?.trim() == SENSOR {
+                return Ok(task.file_name().to_string_lossy().parse()?);
+            }
+        }
+        Err(format!("process {pid} has no thread {SENSOR}").into())
+    }
+
+    /// Steps through `count` telegrams. Returns their profile, and the system calls of each telegram.
+    fn step<'a>(
+        stepper: &mut Stepper,
+        code: &'a Code,
+        count: usize,
+    ) -> Outcome<(Profile<'a>, Vec<BTreeMap<u64, u64>>)> {
+        let (mut profile, mut calls) = (Profile::new(code), Vec::new());
+        stepper.pass(INTERVAL)?;
+        for _ in 0..3 * count {
+            let mut steps = Vec::new();
+            let mut of_status = Vec::new();
+            let mut cost = stepper.telegram(|address, calls, system_call| {
+                let stage = profile.stage(address, calls.iter().map(|call| call.function));
+                steps.push((address, stage));
+                of_status.extend(system_call.filter(|_| stage == profile::Stage::Status));
+            })?;
+            for call in of_status {
+                cost.system_calls.entry(call).and_modify(|count| *count -= 1);
+            }
+            let mut index = 0;
+            steps.retain(|_| {
+                index += 1;
+                !cost.repeats.iter().any(|steps| steps.contains(&(index - 1)))
+            });
+            // On a busy machine, the next telegram may be complete before this one is read.
+            if cost.telegrams == 1 {
+                profile.add(steps.into_iter());
+                calls.push(cost.system_calls);
+            }
+            if calls.len() == count {
+                return Ok((profile, calls));
+            }
+            if cost.lag > INTERVAL / 3 {
+                stepper.pass(INTERVAL)?;
+            }
+        }
+        Err("this machine is too busy: steps did not keep up with the sensor".into())
+    }
+
+    /// Adds the tables of one state of the background.
+    fn show(
+        background: &str,
+        profile: &Profile<'_>,
+        calls: &[BTreeMap<u64, u64>],
+        has_names: bool,
+        cells: &mut Vec<Cell>,
+    ) {
+        let mut add = |table: &str, row: &str, column: &str, values: Vec<f64>| {
+            let column = format!("{column}, {background}").trim_start_matches(", ").to_owned();
+            cells.push(Cell { table: table.to_owned(), row: row.to_owned(), column, unit: "1", values });
+        };
+        let each = |value: fn(&Sum) -> u64| profile.each.iter().map(|sum| value(sum) as f64).collect();
+        add("per telegram", "instructions", "", each(|sum| sum.instructions));
+        add("per telegram", "code lines of 64 bytes", "", each(|sum| sum.lines));
+        add("per telegram", "code pages of 4 KiB", "", each(|sum| sum.pages));
+        let all_calls = calls.iter().map(|calls| calls.values().sum::<u64>() as f64);
+        add("per telegram", "system calls", "", all_calls.collect());
+        let numbers: std::collections::BTreeSet<u64> =
+            calls.iter().flat_map(BTreeMap::keys).copied().collect();
+        for number in numbers {
+            let each = calls.iter().map(|calls| calls.get(&number).copied().unwrap_or(0) as f64);
+            add("system calls per telegram, mean", &call_name(number), "", vec![mean(each)]);
+        }
+        if !has_names {
+            return;
+        }
+        let telegrams = profile.telegrams as f64;
+        let mut rows = |table: &str, row: &str, sum: &Sum| {
+            for (column, count) in
+                [("instructions", sum.instructions), ("code lines", sum.lines), ("code pages", sum.pages)]
+            {
+                add(table, row, column, vec![(count as f64 / telegrams * 10.0).round() / 10.0]);
+            }
+        };
+        for (stage, sum) in &profile.by_stage {
+            rows("by stage, mean", stage.name(), sum);
+        }
+        for (name, sum) in sorted(&profile.by_crate, |sum| sum.instructions) {
+            rows("by crate, mean", name, &sum);
+        }
+        for (name, sum) in sorted(&profile.by_function, |sum| sum.instructions).into_iter().take(SHOWN) {
+            rows(&format!("{SHOWN} functions by instructions, mean, {background}"), name, &sum);
+        }
+        for (name, sum) in sorted(&profile.by_function, |sum| sum.lines).into_iter().take(SHOWN) {
+            rows(&format!("{SHOWN} functions by code lines, mean, {background}"), name, &sum);
+        }
+    }
+
+    fn sorted<'a>(sums: &HashMap<&'a str, Sum>, key: fn(&Sum) -> u64) -> Vec<(&'a str, Sum)> {
+        let mut sorted: Vec<_> = sums.iter().map(|(name, sum)| (*name, *sum)).collect();
+        sorted.sort_by_key(|(name, sum)| (std::cmp::Reverse(key(sum)), *name));
+        sorted
+    }
+
+    fn mean(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+        let count = values.len().max(1) as f64;
+        values.sum::<f64>() / count
+    }
+
+    /// Returns the name of a system call on x86-64.
+    fn call_name(number: u64) -> String {
+        let names = [
+            (0, "read"),
+            (1, "write"),
+            (7, "poll"),
+            (16, "ioctl"),
+            (18, "pwrite64"),
+            (35, "nanosleep"),
+            (44, "sendto"),
+            (77, "ftruncate"),
+            (202, "futex"),
+            (228, "clock_gettime"),
+            (230, "clock_nanosleep"),
+            (271, "ppoll"),
+        ];
+        let name = names.iter().find(|(known, _)| *known == number);
+        name.map_or(format!("number {number}"), |(_, name)| (*name).to_owned())
+    }
+
+    const SENSOR: &str = "front";
+    /// Time between two telegrams at 9,600 baud.
+    const INTERVAL: Duration = Duration::from_millis(773);
+    /// Number of functions in a table.
+    const SHOWN: usize = 20;
+}

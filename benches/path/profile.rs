@@ -1,0 +1,276 @@
+//! Profile of the steps of one thread: where its instructions, code lines and code pages are, by function, crate and
+//! stage.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fs;
+use std::process::Command;
+
+/// The code of a process, with names.
+pub(crate) struct Code {
+    /// Mapped files, by address: start, end and name.
+    files: Vec<(u64, u64, String)>,
+    /// Address in memory and name of each function of the program, by address. Empty if the program has no symbols.
+    functions: Vec<(u64, String)>,
+}
+
+impl Code {
+    /// Reads the memory map of the process `pid`, and the symbols of its program by `nm`.
+    pub(crate) fn of(pid: u32) -> Result<Code, String> {
+        let failed = |error: std::io::Error| format!("process {pid}: {error}");
+        let program = fs::read_link(format!("/proc/{pid}/exe")).map_err(failed)?.display().to_string();
+        let (mut files, mut base) = (Vec::new(), None);
+        for line in fs::read_to_string(format!("/proc/{pid}/maps")).map_err(failed)?.lines() {
+            let words: Vec<&str> = line.split_whitespace().collect();
+            let [range, _, offset, _, _, path] = words[..] else { continue };
+            let Some((start, end)) = range.split_once('-') else { continue };
+            let hex = |text: &str| u64::from_str_radix(text, 16).map_err(|error| error.to_string());
+            let (start, end) = (hex(start)?, hex(end)?);
+            if path == program && hex(offset)? == 0 {
+                base = Some(start);
+            }
+            let name = path.rsplit('/').next().unwrap_or(path);
+            files.push((start, end, if path == program { String::new() } else { name.to_owned() }));
+        }
+        let base = base.ok_or("the program is not in its own memory map")?;
+        Ok(Code { files, functions: functions(&program, base) })
+    }
+
+    /// Returns whether functions have names.
+    pub(crate) fn has_names(&self) -> bool {
+        !self.functions.is_empty()
+    }
+
+    /// Returns the index of the function at `address` and its name; `None` outside of the program.
+    pub(crate) fn function(&self, address: u64) -> Option<(usize, &str)> {
+        if self.file(address).is_none_or(|file| !file.is_empty()) {
+            return None;
+        }
+        let index = self.functions.partition_point(|(start, _)| *start <= address).checked_sub(1)?;
+        Some((index, &self.functions[index].1))
+    }
+
+    /// Returns the name of the mapped file at `address`, which is empty for the program.
+    pub(crate) fn file(&self, address: u64) -> Option<&str> {
+        let file = self.files.iter().find(|(start, end, _)| (*start..*end).contains(&address));
+        file.map(|(_, _, name)| name.as_str())
+    }
+
+    /// Returns the function at `address`, or the file if it is not in the program.
+    pub(crate) fn name(&self, address: u64) -> &str {
+        let name = self.function(address).map(|(_, name)| name);
+        name.or_else(|| self.file(address).filter(|name| !name.is_empty())).unwrap_or("?")
+    }
+}
+
+/// Returns address and name of the functions of `program`, whose first page is at `base`.
+fn functions(program: &str, base: u64) -> Vec<(u64, String)> {
+    let Ok(output) = Command::new("nm").args(["-C", "--defined-only", program]).output() else {
+        return Vec::new();
+    };
+    let mut functions: Vec<_> = String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .filter_map(|line| {
+            let (address, rest) = line.split_once(' ')?;
+            let (kind, name) = rest.split_once(' ')?;
+            let address = u64::from_str_radix(address, 16).ok()?;
+            "tTwW".contains(kind).then(|| (base + address, name.to_owned()))
+        })
+        .collect();
+    functions.sort();
+    functions
+}
+
+/// Returns the crate of the function `name`: the first component of its path, which for a generic function is that of
+/// the crate that defines it.
+pub(crate) fn crate_of(name: &str) -> &str {
+    let Some((path, _)) = name.split_once("::") else { return if name.contains(".so") { name } else { "C" } };
+    path.rsplit(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap_or(path)
+}
+
+/// Stages of the path of a telegram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) enum Stage {
+    Sleeping,
+    Read,
+    Framing,
+    Decode,
+    Zones,
+    Publish,
+    Processors,
+    Bookkeeping,
+    /// The status, which the hub publishes once a second.
+    Status,
+    Other,
+}
+
+/// Stages by a part of the names of functions. The innermost function with a stage counts, so that the shared-memory
+/// library, `memcpy` and the standard library belong to their callers. The first entry that fits a name counts.
+const STAGES: [(&str, Stage); 34] = [
+    ("preprocess::zones::", Stage::Zones),
+    ("Pipeline::check_zones", Stage::Zones),
+    ("scanhub_preprocess::", Stage::Processors),
+    ("Pipeline::process", Stage::Processors),
+    ("lms::arrival::", Stage::Read),
+    ("::defer_read", Stage::Read),
+    ("::can_defer_read", Stage::Read),
+    ("::commit", Stage::Read),
+    ("::spare", Stage::Read),
+    ("SessionDriver<S>::read", Stage::Read),
+    ("scanhub_port::tty::", Stage::Read),
+    ("lms::framer::", Stage::Framing),
+    ("lms::telegram::", Stage::Framing),
+    ("lms::session::", Stage::Framing),
+    ("lms::dialogue::", Stage::Framing),
+    ("lms::measured::", Stage::Decode),
+    ("line::scan::", Stage::Decode),
+    ("link_output::decode", Stage::Decode),
+    ("::copy_from", Stage::Decode),
+    ("daemon::publisher::", Stage::Publish),
+    ("daemon::topics::", Stage::Publish),
+    ("LinkOutput<S>::prepare", Stage::Publish),
+    ("LinkOutput<S>::telegram", Stage::Publish),
+    ("LinkOutput<S>::publish_scan", Stage::Publish),
+    ("scanhub_shm::", Stage::Publish),
+    ("SessionDriver<S>::drain", Stage::Bookkeeping),
+    ("SessionDriver<S>::on_wakeup", Stage::Bookkeeping),
+    ("daemon::diagnosis::", Stage::Bookkeeping),
+    ("daemon::link_stats::", Stage::Bookkeeping),
+    ("LinkCore<S>::", Stage::Bookkeeping),
+    ("daemon::system::", Stage::Sleeping),
+    ("LiveLink<S>::", Stage::Sleeping),
+    ("scanhub_port::clock::", Stage::Sleeping),
+    ("rustix::", Stage::Sleeping),
+];
+
+/// Functions in which everything belongs to the status.
+const STATUS: [&str; 2] = ["LinkCore<S>::show", "LinkCore<S>::publish_status"];
+
+impl Stage {
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Stage::Sleeping => "sleeping",
+            Stage::Read => "read",
+            Stage::Framing => "framing and CRC",
+            Stage::Decode => "decode",
+            Stage::Zones => "zones",
+            Stage::Publish => "publish and doorbell",
+            Stage::Processors => "background, other processors",
+            Stage::Bookkeeping => "bookkeeping",
+            Stage::Status => "status, once a second",
+            Stage::Other => "other",
+        }
+    }
+
+    /// Returns the stage of a function with the name `name`, if it has one.
+    fn of(name: &str) -> Option<Stage> {
+        if STATUS.iter().any(|part| name.contains(part)) {
+            return Some(Stage::Status);
+        }
+        STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, stage)| *stage)
+    }
+}
+
+/// Sums over the telegrams of a profile, for a stage, a crate or a function.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Sum {
+    pub(crate) instructions: u64,
+    pub(crate) lines: u64,
+    pub(crate) pages: u64,
+}
+
+/// Steps of one telegram that have the same stage, crate or function.
+#[derive(Default)]
+struct Steps {
+    instructions: u64,
+    lines: HashSet<u64>,
+    pages: HashSet<u64>,
+}
+
+impl Steps {
+    fn add(&mut self, address: u64) {
+        self.instructions += 1;
+        self.lines.insert(address / LINE);
+        self.pages.insert(address / PAGE);
+    }
+}
+
+/// Profile of several telegrams.
+pub(crate) struct Profile<'a> {
+    code: &'a Code,
+    /// Stage of each function that was met, by its address.
+    stages: HashMap<u64, Option<Stage>>,
+    pub(crate) telegrams: u64,
+    pub(crate) by_stage: BTreeMap<Stage, Sum>,
+    pub(crate) by_crate: HashMap<&'a str, Sum>,
+    pub(crate) by_function: HashMap<&'a str, Sum>,
+    /// Sums of each telegram, without the status.
+    pub(crate) each: Vec<Sum>,
+}
+
+impl<'a> Profile<'a> {
+    pub(crate) fn new(code: &'a Code) -> Profile<'a> {
+        Profile {
+            code,
+            stages: HashMap::new(),
+            telegrams: 0,
+            by_stage: BTreeMap::new(),
+            by_crate: HashMap::new(),
+            by_function: HashMap::new(),
+            each: Vec::new(),
+        }
+    }
+
+    /// Returns the stage of an instruction at `address` in the functions `calls`, outermost first.
+    pub(crate) fn stage(&mut self, address: u64, calls: impl DoubleEndedIterator<Item = u64>) -> Stage {
+        let mut found = self.stage_of(address);
+        for function in calls.rev() {
+            let stage = self.stage_of(function);
+            if stage == Some(Stage::Status) {
+                return Stage::Status;
+            }
+            found = found.or(stage);
+        }
+        found.unwrap_or(Stage::Other)
+    }
+
+    fn stage_of(&mut self, address: u64) -> Option<Stage> {
+        let code = self.code;
+        *self.stages.entry(address).or_insert_with(|| Stage::of(code.name(address)))
+    }
+
+    /// Adds the steps of a telegram.
+    pub(crate) fn add(&mut self, steps: impl Iterator<Item = (u64, Stage)>) {
+        let mut all = Steps::default();
+        let mut by_stage = HashMap::<Stage, Steps>::new();
+        let (mut by_crate, mut by_function) = (HashMap::<&str, Steps>::new(), HashMap::<&str, Steps>::new());
+        for (address, stage) in steps {
+            by_stage.entry(stage).or_default().add(address);
+            if stage == Stage::Status {
+                continue;
+            }
+            all.add(address);
+            let name = self.code.name(address);
+            by_function.entry(name).or_default().add(address);
+            by_crate.entry(crate_of(name)).or_default().add(address);
+        }
+        self.telegrams += 1;
+        let mut sum = Sum::default();
+        sum.add(&all);
+        self.each.push(sum);
+        by_stage.iter().for_each(|(key, steps)| self.by_stage.entry(*key).or_default().add(steps));
+        by_crate.iter().for_each(|(key, steps)| self.by_crate.entry(key).or_default().add(steps));
+        by_function.iter().for_each(|(key, steps)| self.by_function.entry(key).or_default().add(steps));
+    }
+}
+
+impl Sum {
+    fn add(&mut self, steps: &Steps) {
+        self.instructions += steps.instructions;
+        self.lines += steps.lines.len() as u64;
+        self.pages += steps.pages.len() as u64;
+    }
+}
+
+/// Bytes of a code line and of a code page.
+const LINE: u64 = 64;
+const PAGE: u64 = 4096;

@@ -1,0 +1,285 @@
+//! Single-steps a thread of another process by ptrace, and counts what it executes for each telegram: instructions and
+//! system calls. Used by `benches/path` and by `tests/it/path_cost.rs`.
+//!
+//! The cost of a telegram starts with the sleep after the previous telegram was published. It ends before the first sleep
+//! after a doorbell has rung for this one. Single steps take so long that the thread may fall behind. [`Stepper::pass`]
+//! then runs it until telegrams arrive in time again.
+#![allow(dead_code)] // The test needs a part of it.
+
+use std::collections::{BTreeMap, HashMap};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::sys::ptrace;
+use nix::sys::signal::Signal;
+use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
+use nix::unistd::Pid;
+
+/// A thread under ptrace, which only the thread that attached to it can step. It runs freely again after
+/// [`Stepper::detach`].
+pub(crate) struct Stepper {
+    thread: Pid,
+    /// Kind of the instruction at each address that was executed.
+    kinds: HashMap<u64, Kind>,
+    /// Functions that were called and have not returned, outermost first. Those called before the first step are not in
+    /// it.
+    calls: Vec<Call>,
+    /// Number of the system call that the thread has entered, after [`Stepper::pass`].
+    entered: Option<u64>,
+    /// Bytes that were read for the next telegram. Negative if some of an earlier one are missing.
+    read: i64,
+    /// Whether a doorbell has rung for it.
+    has_rung: bool,
+    /// Number of the last system call.
+    last_call: u64,
+}
+
+/// A function that was called.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Call {
+    /// Address of its first instruction.
+    pub(crate) function: u64,
+    /// Address of the return address on the stack.
+    frame: u64,
+}
+
+/// Cost of a telegram, without repeated waits. At 9,600 baud a telegram arrives for 0.7 s, and the hub interrupts its wait
+/// every 50 ms to check for requests. At the usual 500,000 baud there is one wait.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Cost {
+    /// Number of telegrams that the cost is for: more than 1 if the next one was complete before the thread read.
+    pub(crate) telegrams: u64,
+    pub(crate) instructions: u64,
+    /// Number of system calls, by the number of the call.
+    pub(crate) system_calls: BTreeMap<u64, u64>,
+    /// Steps of repeated waits, by their index: from one sleep to the next without another system call between them.
+    pub(crate) repeats: Vec<Range<u64>>,
+    /// Time that the steps took after the last read, in which the thread falls behind.
+    pub(crate) lag: Duration,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    SystemCall,
+    Call,
+    Other,
+}
+
+/// Bytes of a telegram of 361 beams.
+const TELEGRAM: i64 = 732;
+/// Result of a system call that has not returned, `-ENOSYS`.
+const NOT_RETURNED: u64 = -38_i64 as u64;
+
+/// Limit for a telegram. It only bounds a hang: on a busy machine, the steps of one take minutes.
+const PATIENCE: Duration = Duration::from_secs(900);
+
+/// Numbers of system calls on x86-64.
+const READ: u64 = 0;
+const FUTEX: u64 = 202;
+/// Calls in which a thread of the hub sleeps: poll, nanosleep, clock_nanosleep, ppoll.
+const SLEEPS: [u64; 4] = [7, 35, 230, 271];
+/// FUTEX_WAKE and FUTEX_WAKE_BITSET.
+const WAKES: [u64; 2] = [1, 10];
+
+impl Stepper {
+    /// Stops the thread `thread`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason if this process may not trace it.
+    pub(crate) fn attach(thread: i32) -> Result<Stepper, String> {
+        let thread = Pid::from_raw(thread);
+        let refused = |error: Errno| format!("ptrace is not allowed: {error}");
+        ptrace::seize(thread, ptrace::Options::PTRACE_O_TRACESYSGOOD).map_err(refused)?;
+        ptrace::interrupt(thread).map_err(refused)?;
+        let mut stepper = Stepper {
+            thread,
+            kinds: HashMap::new(),
+            calls: Vec::new(),
+            entered: None,
+            read: 0,
+            has_rung: false,
+            last_call: 0,
+        };
+        stepper.wait()?;
+        Ok(stepper)
+    }
+
+    /// Runs the thread until it has published a telegram that it had to wait for, and sleeps again.
+    /// `interval` is the time between two telegrams.
+    pub(crate) fn pass(&mut self, interval: Duration) -> Result<(), String> {
+        loop {
+            let begun = Instant::now();
+            self.run()?;
+            if begun.elapsed() > interval / 2 {
+                self.read = 0;
+                return Ok(());
+            }
+        }
+    }
+
+    /// Runs the thread until the end of a telegram.
+    fn run(&mut self) -> Result<(), String> {
+        self.calls.clear();
+        let (begun, mut signal) = (Instant::now(), None);
+        loop {
+            check(begun)?;
+            ptrace::syscall(self.thread, signal).map_err(lost)?;
+            signal = self.wait()?;
+            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            if signal.is_some() {
+                continue;
+            }
+            let call = registers.orig_rax;
+            if registers.rax == NOT_RETURNED {
+                if self.enter(call, registers.rsi) > 0 {
+                    self.entered = Some(call);
+                    return Ok(());
+                }
+            } else {
+                self.leave(call, registers.rax);
+            }
+        }
+    }
+
+    /// Steps through one telegram. Calls `on_step` before each instruction with its address, the functions that it runs
+    /// in, outermost first, and the number of the system call that it makes, if any.
+    pub(crate) fn telegram(
+        &mut self,
+        mut on_step: impl FnMut(u64, &[Call], Option<u64>),
+    ) -> Result<Cost, String> {
+        let mut cost = Cost::default();
+        let begun = Instant::now();
+        let mut last_read = begun;
+        // Index of the next step, and of the one after the last sleep.
+        let (mut index, mut slept) = (0, 0);
+        if let Some(call) = self.entered.take() {
+            *cost.system_calls.entry(call).or_default() += 1;
+            self.last_call = call;
+            self.step()?;
+        }
+        loop {
+            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            let address = registers.rip;
+            while self.calls.last().is_some_and(|call| call.frame < registers.rsp) {
+                self.calls.pop();
+            }
+            let kind = self.kind(address)?;
+            let call = (kind == Kind::SystemCall).then_some(registers.rax);
+            if let Some(call) = call {
+                cost.telegrams = self.enter(call, registers.rsi);
+                if cost.telegrams > 0 {
+                    let repeated: u64 = cost.repeats.iter().map(|steps| steps.end - steps.start).sum();
+                    cost.instructions = index - repeated;
+                    cost.lag = last_read.elapsed();
+                    return Ok(cost);
+                }
+                let is_sleep = SLEEPS.contains(&call);
+                if is_sleep && index > 0 && SLEEPS.contains(&self.last_call) {
+                    cost.repeats.push(slept..index);
+                } else {
+                    *cost.system_calls.entry(call).or_default() += 1;
+                }
+                if is_sleep {
+                    check(begun)?;
+                    slept = index;
+                }
+                self.last_call = call;
+            }
+            on_step(address, &self.calls, call);
+            index += 1;
+            self.step()?;
+            if kind == Kind::Other {
+                continue;
+            }
+            let registers = ptrace::getregs(self.thread).map_err(lost)?;
+            if let Some(call) = call {
+                self.leave(call, registers.rax);
+                if call == READ {
+                    last_read = Instant::now();
+                }
+            } else {
+                self.calls.push(Call { function: registers.rip, frame: registers.rsp });
+            }
+        }
+    }
+
+    /// Ends the tracing. The thread continues.
+    pub(crate) fn detach(self) {
+        // The process may have exited.
+        let _ = ptrace::detach(self.thread, None);
+    }
+
+    /// Handles the start of a system call. Returns the number of telegrams that end before it.
+    fn enter(&mut self, call: u64, operation: u64) -> u64 {
+        if call == FUTEX && WAKES.contains(&(operation & 0x7f)) {
+            self.has_rung = true;
+        }
+        // The thread may have read a part of the next telegram.
+        let telegrams = (self.read + TELEGRAM / 2) / TELEGRAM;
+        if !SLEEPS.contains(&call) || !self.has_rung || telegrams < 1 {
+            return 0;
+        }
+        self.has_rung = false;
+        self.read -= telegrams * TELEGRAM;
+        telegrams.unsigned_abs()
+    }
+
+    /// Handles the end of a system call.
+    fn leave(&mut self, call: u64, result: u64) {
+        if call == READ {
+            // A negative number is an error.
+            self.read += (result as i64).max(0);
+        }
+    }
+
+    /// Executes one instruction. A signal is delivered first.
+    fn step(&mut self) -> Result<(), String> {
+        let mut signal = None;
+        loop {
+            ptrace::step(self.thread, signal).map_err(lost)?;
+            signal = self.wait()?;
+            if signal.is_none() {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Waits until the thread stops. Returns the signal that stopped it, unless it is that of ptrace.
+    fn wait(&mut self) -> Result<Option<Signal>, String> {
+        match waitpid(self.thread, Some(WaitPidFlag::__WALL)).map_err(lost)? {
+            WaitStatus::Stopped(_, Signal::SIGTRAP)
+            | WaitStatus::PtraceSyscall(_)
+            | WaitStatus::PtraceEvent(..) => Ok(None),
+            WaitStatus::Stopped(_, signal) => Ok(Some(signal)),
+            ended => Err(format!("the thread has ended: {ended:?}")),
+        }
+    }
+
+    /// Returns the kind of the instruction at `address`.
+    fn kind(&mut self, address: u64) -> Result<Kind, String> {
+        if let Some(&kind) = self.kinds.get(&address) {
+            return Ok(kind);
+        }
+        let word = ptrace::read(self.thread, address as ptrace::AddressType).map_err(lost)?;
+        let kind = match word.to_le_bytes() {
+            [0x0f, 0x05, ..] => Kind::SystemCall,
+            // call rel32, and call r/m64 with and without a prefix.
+            [0xe8, ..] => Kind::Call,
+            [0xff, form, ..] | [0x40..=0x4f, 0xff, form, ..] if form >> 3 & 7 == 2 => Kind::Call,
+            _ => Kind::Other,
+        };
+        self.kinds.insert(address, kind);
+        Ok(kind)
+    }
+}
+
+/// Returns an error if no telegram has arrived since `begun` for far too long.
+fn check(begun: Instant) -> Result<(), String> {
+    if begun.elapsed() > PATIENCE { Err("no telegram was published".to_owned()) } else { Ok(()) }
+}
+
+fn lost(error: Errno) -> String {
+    format!("the thread is lost: {error}")
+}
