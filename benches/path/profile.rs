@@ -142,8 +142,14 @@ const STAGES: [(&str, Stage); 34] = [
     ("rustix::", Stage::Sleeping),
 ];
 
-/// Functions in which everything belongs to the status.
-const STATUS: [&str; 2] = ["LinkCore<S>::show", "LinkCore<S>::publish_status"];
+/// Ends of the names of functions in which everything belongs to the status. With it, the hub saves the scanner's identity.
+const STATUS: [&str; 5] = [
+    "LinkCore<S>::show",
+    "LinkCore<S>::show_session",
+    "LinkCore<S>::publish_status",
+    "IdentityCache<S>::save",
+    "Platform>::store_record",
+];
 
 impl Stage {
     pub(crate) fn name(self) -> &'static str {
@@ -163,7 +169,7 @@ impl Stage {
 
     /// Returns the stage of a function with the name `name`, if it has one.
     fn of(name: &str) -> Option<Stage> {
-        if STATUS.iter().any(|part| name.contains(part)) {
+        if STATUS.iter().any(|end| name.ends_with(end)) {
             return Some(Stage::Status);
         }
         STAGES.iter().find(|(part, _)| name.contains(part)).map(|(_, stage)| *stage)
