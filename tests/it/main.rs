@@ -58,6 +58,7 @@ mod mask;
 mod motion;
 mod other_scanner;
 mod pages;
+mod path_cost;
 mod planted_links;
 mod ports;
 mod probe;

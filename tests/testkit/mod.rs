@@ -17,6 +17,8 @@ mod robot;
 mod sender;
 mod side_by_side;
 mod skip;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod steps;
 mod supervisor;
 mod telegrams;
 mod terminal;

@@ -6,7 +6,7 @@ use std::fmt::Display;
 use std::io::Write;
 
 /// What tests can do without, by its name in `SCANHUB_REQUIRE`.
-const NEEDS: [&str; 24] = [
+const NEEDS: [&str; 25] = [
     "bash",
     "cc",
     "c++",
@@ -42,6 +42,8 @@ const NEEDS: [&str; 24] = [
     "root",
     // A place of the program where other users can start it.
     "open-directory",
+    // A machine with x86-64 on which a process may trace its children.
+    "ptrace",
     // Of real sensors, in SCANHUB_DATA.
     "recordings",
 ];
