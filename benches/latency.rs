@@ -36,7 +36,7 @@ fn measure(options: &Options, sensors: usize) -> Outcome<()> {
     for (round, runs) in rounds.iter().enumerate() {
         let of = |(number, run): (usize, &Run)| {
             let is_hub = comparison.candidates[number].is_hub();
-            run.latencies(&sent[comparison.place(number, round)], common_span(runs), is_hub)
+            run.latencies(&sent[comparison.place(number, round)], shared_span(runs), is_hub)
         };
         latencies.push(runs.iter().enumerate().map(of).collect::<Outcome<Vec<_>>>()?);
     }
@@ -112,7 +112,7 @@ impl Run {
 }
 
 /// Returns the span in which all runs of a round count.
-fn common_span(runs: &[Run]) -> (u64, u64) {
+fn shared_span(runs: &[Run]) -> (u64, u64) {
     let spans = runs.iter().map(Run::span);
     spans.fold((0, u64::MAX), |all, span| (all.0.max(span.0), all.1.min(span.1)))
 }

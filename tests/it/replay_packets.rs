@@ -182,11 +182,13 @@ fn bytes_of_a_line_are_played_by_the_scanners_own_clock() {
     let (recording, bytes) = (env.word("telegrams.mcap"), env.word("telegrams.bin"));
     assert_eq!(env.run(&["convert", &recording, &bytes]).code, Some(0));
     let recorded = samples(&env.path("all.mcap"), "front/scan");
-    let link = format!("--link=front=file:{bytes}");
-    let hub = env.hub(&[&link, "--set=link.front.family=ld"]);
+    let family = "--set=link.front.family=ld";
+    let words = ["replay", "--json", "--no-system-config", "--hold", "--paused", family, &bytes];
+    let player = env.start(&words).ready();
     let mut echo = env.echo(&["front/scan"]);
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
     let scans = echo.await_lines(20, "a scan", is_class("scan"));
-    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!((echo.end(INT).code, player.end(INT).code), (Some(0), Some(0)));
     let stamps = |of: &Value| number(of, "stamp_ns") as i64;
     // In which turn it begins depends on what came before: they are found by what they say.
     let ranges: Vec<Vec<Option<u64>>> = scans
