@@ -431,21 +431,34 @@ fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) 
     };
     let ForegroundArrays { bits, ranges, .. } = out.begin(head);
     bits.fill(0);
-    let mut beams = 0;
-    for ((byte, classes), values) in bits.iter_mut().zip(classes.chunks(8)).zip(scan.ranges().chunks(8)) {
-        if !classes.iter().fold(false, |any, &class| any | (class == Class::Foreground)) {
-            continue;
-        }
-        for (bit, (&class, &value)) in classes.iter().zip(values).enumerate() {
-            if class == Class::Foreground {
-                *byte |= 1 << bit;
-                ranges[beams] = value;
-                beams += 1;
-            }
-        }
+    let values = scan.ranges();
+    let (mut beams, mut behind) = (0, 0);
+    while let Some(beam) = position(classes, behind, is_foreground) {
+        bits[beam / 8] |= 1 << (beam % 8);
+        ranges[beams] = values[beam];
+        beams += 1;
+        behind = beam + 1;
     }
     ranges[beams..].fill(0);
     out.beams = beams as u16;
+}
+
+fn is_foreground(class: Class) -> bool {
+    class == Class::Foreground
+}
+
+/// Returns the index of the first value from `from` on that `is_it`. Such values are rare, so whole blocks are
+/// compared, without a branch for each value.
+fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
+    const BLOCK: usize = 32;
+    let mut begin = from;
+    while let Some(block) = values[begin..].first_chunk::<BLOCK>() {
+        if block.iter().fold(false, |any, &value| any | is_it(value)) {
+            break;
+        }
+        begin += BLOCK;
+    }
+    values[begin..].iter().position(|&value| is_it(value)).map(|ahead| begin + ahead)
 }
 
 /// Error: a model that does not fit the sensor.
@@ -508,8 +521,7 @@ impl Runs {
         seen.fill(INVALID);
         told.fill(INVALID);
         let mut begin = 0;
-        while let Some(ahead) = classes[begin..].iter().position(|&class| class == Class::Foreground) {
-            let first = begin + ahead;
+        while let Some(first) = position(classes, begin, is_foreground) {
             let (mut behind, mut beams, mut nearest) = (first, 0, INVALID);
             for (i, class) in classes.iter().enumerate().skip(first) {
                 match class {

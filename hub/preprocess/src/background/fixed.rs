@@ -4,7 +4,7 @@
 //! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
 //! [`Multi`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
-use super::{Class, INVALID, Limits, Runs};
+use super::{Class, INVALID, Limits, Runs, position};
 use scanhub_schema::Background;
 
 /// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of
@@ -140,10 +140,9 @@ impl Multi {
         self.compare(readings, bounds, classes);
         let nearest = &self.nearest[..readings.len()];
         let mut left = 0;
-        while let Some(ahead) = nearest[left..].iter().position(|&range| range == INVALID) {
-            let unknown = left + ahead;
-            let Some(count) = nearest[unknown..].iter().position(|&range| range != INVALID) else { break };
-            left = unknown + count;
+        while let Some(unknown) = position(nearest, left, |range| range == INVALID) {
+            let Some(known) = position(nearest, unknown, |range| range != INVALID) else { break };
+            left = known;
             if let Some(right) = unknown.checked_sub(1) {
                 self.compare_with_neighbors(right, left, readings, bounds, classes);
             }
