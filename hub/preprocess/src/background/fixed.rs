@@ -1,8 +1,9 @@
 //! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one
 //! range per beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of
-//! [`Multi`] were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The loops of [`Multi`] are
+//! not inlined into one function, where they would execute more instructions on more code lines. Its constants were
+//! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, Runs, position};
 use scanhub_schema::Background;
@@ -84,11 +85,11 @@ impl Paper {
 pub(super) struct Multi {
     slots: [Slots; SLOTS],
     /// Weight that the next surface of the beam gains: more if previous scans had no return.
-    gain: Box<[u16]>,
+    gain: Box<[i16]>,
     runs: Runs,
     /// The nearest background of each beam, and the weight that its surface gains, while a scan is processed.
     nearest: Box<[u16]>,
-    gains: Box<[u16]>,
+    gains: Box<[i16]>,
 }
 
 /// A surface of each beam, if it has one.
@@ -96,19 +97,19 @@ pub(super) struct Multi {
 struct Slots {
     /// In device units.
     range: Box<[u16]>,
-    /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others. 0:
-    /// there is no surface.
-    weight: Box<[u16]>,
+    /// How well the surface is known; [`NONE`] if there is no surface. The weight grows with each scan in which the
+    /// beam met the surface, and decreases in others.
+    weight: Box<[i16]>,
 }
 
-/// Limits of the steps, in units of ranges and of weights.
+/// Limits of the steps, as numbers that compare like signed ranges and weights.
 #[derive(Clone, Copy)]
 struct Bounds {
-    threshold: u16,
-    returned: u16,
-    full: u16,
-    known: u16,
-    replaced: u16,
+    threshold: i16,
+    returned: i16,
+    full: i16,
+    known: i16,
+    replaced: i16,
 }
 
 impl Multi {
@@ -116,11 +117,11 @@ impl Multi {
     pub(super) fn new(beams: usize) -> Multi {
         let all = |value: u16| vec![value; beams].into_boxed_slice();
         Multi {
-            slots: std::array::from_fn(|_| Slots { range: all(0), weight: all(0) }),
-            gain: all(MET),
+            slots: std::array::from_fn(|_| Slots { range: all(0), weight: vec![NONE; beams].into() }),
+            gain: vec![MET; beams].into(),
             runs: Runs::new(beams),
             nearest: all(INVALID),
-            gains: all(MET),
+            gains: vec![MET; beams].into(),
         }
     }
 
@@ -128,7 +129,7 @@ impl Multi {
     pub(super) fn forget(&mut self) {
         self.slots.iter_mut().for_each(|slots| {
             slots.range.fill(0);
-            slots.weight.fill(0);
+            slots.weight.fill(NONE);
         });
         self.gain.fill(MET);
         self.runs.forget();
@@ -144,7 +145,7 @@ impl Multi {
             let Some(known) = position(nearest, unknown, |range| range != INVALID) else { break };
             left = known;
             if let Some(right) = unknown.checked_sub(1) {
-                self.compare_with_neighbors(right, left, readings, bounds, classes);
+                self.compare_with_neighbors(right, left, readings, limits, classes);
             }
         }
         self.runs.keep(readings, limits, classes);
@@ -155,6 +156,7 @@ impl Multi {
 
     /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
     /// is none.
+    #[inline(never)]
     fn compare(&mut self, readings: &[u16], bounds: Bounds, classes: &mut [Class]) {
         let n = readings.len();
         // All slices have one length, so the loop needs no bounds checks.
@@ -165,7 +167,7 @@ impl Multi {
             for (ranges, weights) in &slots {
                 let is_known = weights[i] >= bounds.known;
                 known |= is_known;
-                ends |= is_known & (ranges[i].abs_diff(reading) <= bounds.threshold);
+                ends |= is_known & (signed(ranges[i].abs_diff(reading)) <= bounds.threshold);
                 range = if is_known & (ranges[i] < range) { ranges[i] } else { range };
             }
             *nearest = if known { range } else { INVALID };
@@ -183,14 +185,16 @@ impl Multi {
         right: usize,
         left: usize,
         readings: &[u16],
-        bounds: Bounds,
+        limits: &Limits,
         classes: &mut [Class],
     ) {
-        let limit = self.nearest[right].min(self.nearest[left]).saturating_sub(bounds.threshold);
+        let bounds = Bounds::of(limits);
+        let limit = self.nearest[right].min(self.nearest[left]).saturating_sub(limits.threshold);
         for i in left.saturating_sub(ASIDE).max(right + 1)..left.min(right + ASIDE + 1) {
             let reading = readings[i];
             let met = |slots: &Slots| {
-                slots.weight[i] >= bounds.replaced && slots.range[i].abs_diff(reading) <= bounds.threshold
+                slots.weight[i] >= bounds.replaced
+                    && signed(slots.range[i].abs_diff(reading)) <= bounds.threshold
             };
             if reading < limit && reading != INVALID && !self.slots.iter().any(met) {
                 classes[i] = Class::Foreground;
@@ -201,6 +205,7 @@ impl Multi {
     /// Updates the surfaces. The one nearest to a reading, within the threshold, was met. The others lose weight: those
     /// that the beam passed through more than those that may be hidden. A reading of no surface replaces the least
     /// known one, unless all are known too well.
+    #[inline(never)]
     fn learn(&mut self, readings: &[u16], bounds: Bounds) {
         self.gain(readings, bounds);
         let n = readings.len();
@@ -210,16 +215,16 @@ impl Multi {
             let range = slots.each_ref().map(|(ranges, _)| ranges[i]);
             let weight = slots.each_ref().map(|(_, weights)| weights[i]);
             let (new_range, new_weight) = learned(range, weight, reading, gains[i], bounds);
-            let valid = reading != INVALID;
             for (k, (ranges, weights)) in slots.iter_mut().enumerate() {
-                ranges[i] = if valid { new_range[k] } else { range[k] };
-                weights[i] = if valid { new_weight[k] } else { weight[k] };
+                ranges[i] = new_range[k];
+                weights[i] = new_weight[k];
             }
         }
     }
 
     /// Computes the weights that the surfaces gain in this scan. A separate loop, because the processor does not do all
     /// of this at once in the loop over the surfaces.
+    #[inline(never)]
     fn gain(&mut self, readings: &[u16], bounds: Bounds) {
         for ((gain, next), &reading) in self.gains.iter_mut().zip(&mut self.gain).zip(readings) {
             let is_far = reading == Background::FAR;
@@ -232,9 +237,9 @@ impl Multi {
 
     /// Uses `range` as the only background of beam `i`, as well known as possible.
     pub(super) fn adopt(&mut self, i: usize, range: u16) {
-        self.slots.iter_mut().for_each(|slots| slots.weight[i] = 0);
+        self.slots.iter_mut().for_each(|slots| slots.weight[i] = NONE);
         self.slots[0].range[i] = range;
-        self.slots[0].weight[i] = u16::MAX;
+        self.slots[0].weight[i] = i16::MAX;
     }
 
     /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
@@ -251,52 +256,58 @@ impl Multi {
 #[inline]
 fn learned(
     range: [u16; SLOTS],
-    weight: [u16; SLOTS],
+    weight: [i16; SLOTS],
     reading: u16,
-    gain: u16,
+    gain: i16,
     bounds: Bounds,
-) -> ([u16; SLOTS], [u16; SLOTS]) {
-    const NOT_MET: u16 = u16::MAX;
+) -> ([u16; SLOTS], [i16; SLOTS]) {
+    const NOT_MET: i16 = i16::MAX;
     let mut apart = [NOT_MET; SLOTS];
     let mut least_apart = NOT_MET;
     for k in 0..SLOTS {
-        let away = range[k].abs_diff(reading);
-        apart[k] = if (weight[k] > 0) & (away <= bounds.threshold) { away } else { NOT_MET };
+        let away = signed(range[k].abs_diff(reading));
+        apart[k] = if (weight[k] > NONE) & (away <= bounds.threshold) { away } else { NOT_MET };
         least_apart = least_apart.min(apart[k]);
     }
     let (mut new_range, mut new_weight) = (range, weight);
-    let mut open = least_apart != NOT_MET;
-    let mut least = u16::MAX;
+    let valid = reading != INVALID;
+    let mut open = valid & (least_apart != NOT_MET);
+    let mut least = i16::MAX;
     for k in 0..SLOTS {
         let met = open & (apart[k] == least_apart);
         open &= !met;
         let step = (reading.wrapping_sub(range[k]) as i16) / DRAWN;
-        new_range[k] = if met { range[k].wrapping_add_signed(step) } else { range[k] };
-        let before = weight[k].min(bounds.full);
-        let leak = if reading > range[k] { PASSED } else { HIDDEN };
-        let more = before.saturating_add(gain).min(bounds.full);
-        new_weight[k] = if met { more } else { before.saturating_sub(leak) };
+        new_range[k] = range[k].wrapping_add_signed(if met { step } else { 0 });
+        let leak = if signed(reading) > signed(range[k]) { -PASSED } else { -HIDDEN };
+        let change = if met { gain } else { leak };
+        let change = if valid { change } else { 0 };
+        new_weight[k] = weight[k].min(bounds.full).saturating_add(change).min(bounds.full);
         least = least.min(new_weight[k]);
     }
-    let mut homeless = (least_apart == NOT_MET) & (least < bounds.replaced);
+    let mut homeless = valid & (least_apart == NOT_MET) & (least < bounds.replaced);
     for k in 0..SLOTS {
         let replaced = homeless & (new_weight[k] == least);
         homeless &= !replaced;
         new_range[k] = if replaced { reading } else { new_range[k] };
-        new_weight[k] = if replaced { gain } else { new_weight[k] };
+        new_weight[k] = if replaced { NONE.wrapping_add(gain) } else { new_weight[k] };
     }
     (new_range, new_weight)
+}
+
+/// Maps unsigned to signed numbers in the same order. For 16 bits, SSE2 compares only signed ones in one instruction.
+fn signed(value: u16) -> i16 {
+    (value ^ 0x8000) as i16
 }
 
 impl Bounds {
     fn of(limits: &Limits) -> Bounds {
         let scans = limits.scans;
         Bounds {
-            threshold: limits.threshold,
-            returned: MET * (scans / RETURNED_OF).clamp(1, RETURNED),
-            full: MET * scans,
-            known: KNOWN * scans,
-            replaced: REPLACED * scans,
+            threshold: signed(limits.threshold),
+            returned: MET * ((scans / RETURNED_OF).clamp(1, RETURNED) as i16),
+            full: signed(MET as u16 * scans),
+            known: signed(KNOWN * scans),
+            replaced: signed(REPLACED * scans),
         }
     }
 }
@@ -307,8 +318,10 @@ const SLOTS: usize = 3;
 /// follow a person who walks.
 const DRAWN: i16 = 16;
 
+/// Weight of a surface that does not exist.
+const NONE: i16 = i16::MIN;
 /// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
-const MET: u16 = 8;
+const MET: i16 = 8;
 /// A surface also counts as met in the scans just before that had no return: at most this number, including the one in
 /// which it was met, and at most one per this number of configured scans. So a wall that returns 15 % of the beams is
 /// background after 5/4 of the configured scans, and a person who stands there no sooner because of a lost beam.
@@ -317,10 +330,10 @@ const RETURNED_OF: u16 = 16;
 /// Weight lost in a scan that saw something behind the surface. An object that was removed is no longer background
 /// after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally becomes
 /// background.
-const PASSED: u16 = 4;
+const PASSED: i16 = 4;
 /// Weight lost in a scan that saw something in front of the surface, which may still exist. Not 0, because otherwise
 /// all slots could be taken by hidden surfaces.
-const HIDDEN: u16 = 1;
+const HIDDEN: i16 = 1;
 /// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.
 const KNOWN: u16 = 5;
