@@ -564,7 +564,7 @@ impl Nearest {
             (1..bounds.len()).fold(0, |best, block| if bounds[block] < bounds[best] { block } else { best });
         let mut nearest = self.nearer(best, ranges, (f64::INFINITY, usize::MAX));
         for (block, &bound) in bounds.iter().enumerate() {
-            if bound <= nearest.0 {
+            if block != best && bound <= nearest.0 {
                 nearest = self.nearer(block, ranges, nearest);
             }
         }
