@@ -97,8 +97,8 @@ pub(super) struct Multi {
 struct Slots {
     /// In device units.
     range: Box<[u16]>,
-    /// How well the surface is known; [`NONE`] if there is no surface. The weight grows with each scan in which the
-    /// beam met the surface, and decreases in others.
+    /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others.
+    /// [`NONE`]: there is no surface.
     weight: Box<[i16]>,
 }
 
