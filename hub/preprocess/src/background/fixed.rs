@@ -1,8 +1,8 @@
 //! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one
 //! range per beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The loops of [`Multi`] are
-//! not inlined into one function, where they would execute more instructions on more code lines. Its constants were
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The loops of [`Multi`]
+//! are not inlined into one function, where they would execute more instructions on more code lines. Its constants were
 //! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, Runs, position};
