@@ -24,8 +24,7 @@ use scanhub_network::now;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
-use scanhub_verbs::lossy_writer::LossyWriter;
-use scanhub_verbs::output::{End, Output, quiet};
+use scanhub_verbs::output::{End, LossyWriter, Output, quiet};
 
 pub use check::check;
 use report::Report;

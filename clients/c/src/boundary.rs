@@ -1,39 +1,39 @@
-//! Addresses that come from C, made into what Rust may look at, and the sample that C sees. The only file here with unsafe
-//! code; refuses to know what the calls do.
+//! The boundary to C: addresses from C as Rust references, the sample that C sees, and the error of a call. All unsafe code of
+//! this crate is here.
 #![allow(unsafe_code)]
 
-use std::ffi::{CStr, c_char, c_int, c_void};
+use std::cell::RefCell;
+use std::ffi::{CStr, CString, c_char, c_int, c_void};
 use std::mem::MaybeUninit;
 use std::ptr;
 
-use scanhub_schema::Header;
+use scanhub_schema::{Failure, Header, Kind};
 
-use crate::call_error::CallError;
-use crate::table::Opaque;
+use crate::handle::Opaque;
 
 /// `scanhub_sample` of the header.
 #[repr(C)]
 pub struct Lent {
-    /// Numbers, stamps and quality; NULL: nobody sent it.
+    /// Header of the sample. NULL if no publisher sent it.
     pub header: *const Header,
-    /// The payload, where it lies.
+    /// Payload, in the memory of the topic.
     pub payload: *const c_void,
-    /// Its bytes.
+    /// Bytes of the payload.
     pub length: usize,
     /// Samples of this topic that were sent before it and not received.
     pub missed: u64,
     /// 1: the hub restarted since the last sample.
     pub restarted: c_int,
-    /// 1: zones that are unknown because nothing was heard.
+    /// 1: zones that are unknown after a silence.
     pub stale: c_int,
-    /// Whose it is.
+    /// Handle that lent the sample.
     pub of: *mut Opaque,
-    /// Under which number it is lent there.
+    /// Number of the loan in that handle.
     pub number: u64,
 }
 
 impl Lent {
-    /// Nothing is lent.
+    /// Returns an empty sample, which is not lent.
     pub(crate) fn none() -> Lent {
         Lent {
             header: ptr::null(),
@@ -48,30 +48,30 @@ impl Lent {
     }
 }
 
-/// The text at `address`; nothing for NULL.
+/// Returns the text at `address`. `None` for NULL.
 pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallError> {
     if address.is_null() {
         return Ok(None);
     }
-    // SAFETY: it is not NULL, and the header asks for a text that ends with 0 and stays as it is until the call is over;
-    // no caller here keeps it longer.
+    // SAFETY: it is not NULL, and the header requires a text that ends with 0 and does not change during the call. No caller in
+    // this crate keeps it longer.
     let text = unsafe { CStr::from_ptr(address) };
     let not_text = CallError::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
     text.to_str().map(Some).map_err(|_| not_text)
 }
 
-/// Where an answer goes to; what lies there before may be anything.
+/// Returns the memory for an output argument. Its old content may be anything.
 pub(crate) fn place<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, CallError> {
     check(address)?;
-    // SAFETY: it is not NULL and aligned, and the header asks for room for one T that nobody else uses during the call; no
-    // caller here keeps it longer.
+    // SAFETY: it is not NULL and aligned, and the header requires room for one T that only the library uses during the call. No
+    // caller in this crate keeps it longer.
     unsafe { address.cast::<MaybeUninit<T>>().as_mut() }.ok_or(NULL)
 }
 
-/// A sample that was filled by an earlier call.
+/// Returns a sample that an earlier call filled.
 pub(crate) fn sample<'a>(address: *mut Lent) -> Result<&'a mut Lent, CallError> {
     check(address)?;
-    // SAFETY: as in `place`; the header asks for a sample that was taken or zeroed, and no value of a field is impossible.
+    // SAFETY: as in `place`. The header requires a sample that was taken or zeroed, and every value of a field is valid.
     unsafe { address.as_mut() }.ok_or(NULL)
 }
 
@@ -86,3 +86,57 @@ fn check<T>(address: *mut T) -> Result<(), CallError> {
 }
 
 const NULL: CallError = CallError::Argument("an argument is NULL", "give the address of a variable");
+
+/// Error of a call from C: a negative number for the program, and a message with a remedy for its user.
+pub(crate) enum CallError {
+    /// An invalid argument, and the remedy.
+    Argument(&'static str, &'static str),
+    /// A failure of the client library.
+    Failure(Failure),
+    /// A panic. Its message is on stderr.
+    Bug,
+}
+
+impl CallError {
+    /// Returns the number in the header, `SCANHUB_REFUSED_` .. .
+    fn number(&self) -> c_int {
+        match self {
+            CallError::Argument(..) => -1,
+            CallError::Failure(failure) => match failure.kind {
+                Kind::Configuration => -2,
+                Kind::Short => -3,
+                _ => -4,
+            },
+            CallError::Bug => -5,
+        }
+    }
+
+    /// Stores the message for [`last_message`], and returns the number.
+    pub(crate) fn keep(&self) -> c_int {
+        let message = match self {
+            CallError::Argument(what, hint) => format!("{what}\n  {hint}"),
+            CallError::Failure(failure) => failure.to_string(),
+            CallError::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
+        };
+        // Messages are printable, so they contain no 0.
+        let message = CString::new(message).unwrap_or_default();
+        // A thread that is ending stores nothing.
+        let _ = LAST.try_with(|last| last.replace(message));
+        self.number()
+    }
+}
+
+impl From<Failure> for CallError {
+    fn from(failure: Failure) -> CallError {
+        CallError::Failure(failure)
+    }
+}
+
+/// Returns the message of the last error of this thread, valid until its next one. Empty if there was none.
+pub(crate) fn last_message() -> *const c_char {
+    LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(c"".as_ptr())
+}
+
+thread_local! {
+    static LAST: RefCell<CString> = RefCell::default();
+}

@@ -1,9 +1,18 @@
-//! Objects behind the handles of a C program: a subscription to any topic, with the samples that are lent to the
-//! program, and a mount whose angles the program publishes.
+//! Objects behind the handles of a C program, and the table of the handles of a thread. An object is a subscription to any topic,
+//! with the samples that are lent to the program, or a mount whose angles the program publishes.
+//!
+//! A handle is a number that looks like an address. The table looks up each number that C passes, and never dereferences it. A
+//! child after `fork` has a copy of the table and never uses it, because the samples and the slots at the hub belong to the
+//! parent.
 
+use std::any::Any;
+use std::cell::RefCell;
 use std::ffi::{CString, c_char, c_int};
 use std::os::fd::AsRawFd;
+use std::process;
 use std::ptr;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
@@ -12,8 +21,7 @@ use scanhub_client::{
 };
 use scanhub_schema::{Failure, Header, Tilt, Topic, limits};
 
-use crate::boundary::Lent;
-use crate::call_error::CallError;
+use crate::boundary::{CallError, Lent};
 
 /// An open subscription.
 pub(crate) struct Handle {
@@ -306,3 +314,82 @@ impl Mount {
         Ok(if stamp_ns == 0 { self.0.send(fill) } else { self.0.send_at(stamp_ns, fill) }?)
     }
 }
+
+/// `struct scanhub_attachment` and `struct scanhub_publication` of the header. No value of it exists.
+#[repr(C)]
+pub struct Opaque {
+    _nothing: [u8; 0],
+}
+
+thread_local! {
+    static TABLE: RefCell<Vec<Entry>> = const { RefCell::new(Vec::new()) };
+}
+
+/// Object in the table of a thread.
+struct Entry {
+    number: usize,
+    process: u32,
+    /// Boxed, because the samples that an object lends must not move when the table grows. `None` only while the entry is
+    /// dropped.
+    object: Option<Box<dyn Any>>,
+}
+
+impl Entry {
+    fn has_handle(&self, handle: *mut Opaque) -> bool {
+        self.number == handle.addr() && self.process == process::id()
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        let object = self.object.take();
+        if self.process != process::id() {
+            // The address is stored, so that a leak checker reports no leak.
+            let mut kept = OF_PARENTS.lock().unwrap_or_else(PoisonError::into_inner);
+            kept.extend(object.map(|object| Box::into_raw(object).expose_provenance()));
+        }
+    }
+}
+
+/// Addresses of the objects that a child has copied from its parent.
+static OF_PARENTS: Mutex<Vec<usize>> = Mutex::new(Vec::new());
+
+/// Next number of a handle. A process uses no number twice.
+static NEXT: AtomicUsize = AtomicUsize::new(1);
+
+/// Stores `object` for this thread, and returns its handle.
+pub(crate) fn insert<T: Any>(object: T) -> Result<*mut Opaque, CallError> {
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let entry = Entry { number, process: process::id(), object: Some(Box::new(object)) };
+    let kept = TABLE.try_with(|table| table.borrow_mut().push(entry));
+    kept.map(|()| ptr::without_provenance_mut(number)).map_err(|_| UNKNOWN)
+}
+
+/// Calls `use_it` with the object of `handle`, if it has this type.
+pub(crate) fn with<T: Any, R>(
+    handle: *mut Opaque,
+    use_it: impl FnOnce(&mut T) -> Result<R, CallError>,
+) -> Result<R, CallError> {
+    let found = TABLE.try_with(|table| {
+        let mut table = table.borrow_mut();
+        let entry = table.iter_mut().find(|entry| entry.has_handle(handle));
+        use_it(entry.and_then(|entry| entry.object.as_mut()?.downcast_mut()).ok_or(UNKNOWN)?)
+    });
+    found.unwrap_or(Err(UNKNOWN))
+}
+
+/// Drops the object of `handle` with everything that it holds, if it has this type.
+pub(crate) fn remove<T: Any>(handle: *mut Opaque) -> Result<(), CallError> {
+    let removed = TABLE.try_with(|table| {
+        let mut table = table.borrow_mut();
+        let is_such = |entry: &Entry| entry.object.as_ref().is_some_and(|object| object.is::<T>());
+        let at = table.iter().position(|entry| entry.has_handle(handle) && is_such(entry));
+        Ok(table.swap_remove(at.ok_or(UNKNOWN)?))
+    });
+    removed.unwrap_or(Err(UNKNOWN)).map(drop)
+}
+
+const UNKNOWN: CallError = CallError::Argument(
+    "this thread has no such handle",
+    "a handle is used from when it was opened until it is closed, by the thread that opened it; a child opens its own",
+);

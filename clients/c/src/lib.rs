@@ -2,10 +2,8 @@
 //! handle is a number, not an address, so the library detects a handle that was closed or belongs to another thread.
 
 mod boundary;
-mod call_error;
 mod export;
 mod handle;
-mod table;
 
 pub use boundary::Lent;
 pub use export::{
@@ -13,4 +11,4 @@ pub use export::{
     scanhub_open_robot_early, scanhub_publish_tilt, scanhub_release, scanhub_send_tilt, scanhub_take,
     scanhub_unpublish, scanhub_version, scanhub_wait,
 };
-pub use table::Opaque;
+pub use handle::Opaque;

@@ -1,13 +1,14 @@
-//! The library of every program that follows a hub of scanhub, or publishes topics of its own beside it. A program depends on
-//! this crate alone.
+//! The client library: subscribes to the topics of a hub, and publishes topics next to those of the hub. A program needs no other
+//! crate.
 //!
-//! - [`subscribe`] follows one topic of one sensor in shared memory, without a copy, over restarts of the hub.
-//! - [`zones`] and [`robot`] follow the verdict of one sensor and of all: a silence becomes [`Verdict::Unknown`] by itself.
-//! - [`publish`] makes a topic that others follow.
-//! - [`request`] asks the hub for something, [`live_sensors`] says which sensors it has.
+//! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after restarts of the
+//!   hub.
+//! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is [`Verdict::Unknown`].
+//! - [`publish`] creates a topic for other programs.
+//! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
 //! - [`streams`] is for programs that follow many topics in one thread.
 //!
-//! Hub and programs must be of the same version: they share memory.
+//! Hub and programs share memory, so they must have the same version. The library prints nothing.
 //!
 //! # Examples
 //!
@@ -25,9 +26,6 @@
 //!     Ok(())
 //! }
 //! ```
-//!
-//! The crate knows only `schema`: a hub is a lock that is held and topics that are there. It prints nothing and refuses to
-//! know verbs.
 
 pub mod clock;
 mod control;
@@ -38,7 +36,6 @@ mod publish;
 mod robot;
 mod sample;
 mod session;
-pub mod streams;
 mod subscribe;
 mod wait;
 mod zones;
@@ -52,12 +49,45 @@ pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesFollower, zones};
 
-/// The types of topics and payloads. A program needs no second dependency.
+/// Types of topics and payloads, so that a program needs no other dependency.
 pub use scanhub_schema::{
     Age, Failure, Flags, Header, Kind, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake,
     payloads::*,
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
+
+/// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for programs that
+/// need more than a [`Subscription`].
+///
+/// # Examples
+///
+/// ```no_run
+/// use scanhub_client::streams::{Session, Source};
+/// use scanhub_client::{Failure, Topic, places};
+///
+/// fn main() -> Result<(), Failure> {
+///     let mut session = Session::new(places(None)?);
+///     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
+///     loop {
+///         session.look()?;
+///         for source in &mut sources {
+///             while let Some(sample) = source.receive(&mut session)? {
+///                 println!("{} bytes", sample.bytes().len());
+///             }
+///         }
+///         session.wait(None)?;
+///     }
+/// }
+/// ```
+pub mod streams {
+    pub use crate::follower::{Follower, Noted, Numbers};
+    pub use crate::join::Join;
+    pub use crate::presence::{Change, GRACE, Who, find};
+    pub use crate::robot::{RobotHeard, RobotSource};
+    pub use crate::sample::{Sample, Source};
+    pub use crate::session::Session;
+    pub use crate::zones::{Freshness, ZonesSource, ZonesState};
+}
 
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]

@@ -20,8 +20,7 @@ use scanhub_shm::Domain;
 use scanhub_verbs::context::Context;
 use scanhub_verbs::duration;
 use scanhub_verbs::follow::Notice;
-use scanhub_verbs::lossy_writer::LossyWriter;
-use scanhub_verbs::output::{End, Output, quiet};
+use scanhub_verbs::output::{End, LossyWriter, Output, quiet};
 use serde::Serialize;
 
 use crate::forward::{self, Forwarder, Selection};

@@ -1,19 +1,24 @@
 //! `scanhub latency`: measures how old samples are on arrival, and in which span that time passed. Other programs measure
 //! the same if they use the client library and wait in the same way.
 
-mod conditions;
 mod spans;
 
 use std::io::{self, Write};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
+use rustix::mm::{MlockAllFlags, mlockall};
+use rustix::time::{ClockId, Timespec, clock_getres};
 use scanhub_client::streams::Sample;
 use scanhub_client::{Wait, clock};
 use scanhub_schema::{Failure, Flags, Kind};
 use serde::Serialize;
+use thread_priority::{
+    Error, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
+};
 
-use self::conditions::Conditions;
 use self::spans::{Quantiles, Span, Spans};
 use crate::context::Context;
 use crate::follow::{Arrival, Bounds, Event, Following, Notice};
@@ -65,9 +70,8 @@ To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p
 const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 impl LatencyArgs {
-    /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end to `out`. Each line
-    /// covers the run so far. Without `json`, conditions and notices go to `notes` (stderr). The result has bars on
-    /// a terminal.
+    /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end. Each line covers the
+    /// run so far. Without `--json`, conditions and notices go to stderr. The result has bars on a terminal.
     ///
     /// # Errors
     ///
@@ -345,6 +349,112 @@ fn time(ns: u64) -> String {
     }
 }
 
+/// Conditions of a measurement: priority and memory of the process, and resolution of the clock. Line of class `conditions`.
+#[derive(Clone, Debug, Serialize)]
+#[serde(tag = "class", rename = "conditions")]
+struct Conditions {
+    wait: &'static str,
+    /// Whether the thread has SCHED_FIFO with the lowest priority, which precedes all threads without one.
+    realtime: bool,
+    memory_locked: bool,
+    /// Time that one read of the clock takes.
+    clock_read_ns: f64,
+    clock_resolution_ns: u64,
+    /// Requests that the system refused, with the reason and a remedy.
+    refused: Vec<String>,
+}
+
+impl Conditions {
+    /// Takes real-time priority for the calling thread and locks the memory of its process if `is_realtime` and as far as
+    /// permitted, so that other programs do not add to the latency. Both stay.
+    fn take(wait: Wait, is_realtime: bool) -> Conditions {
+        let processors = thread::available_parallelism().map_or(1, usize::from);
+        let normal = Conditions {
+            wait: match wait {
+                Wait::Doorbell => "doorbell",
+                Wait::Event => "event",
+                Wait::Spin => "spin",
+            },
+            realtime: false,
+            memory_locked: false,
+            clock_read_ns: (clock_read_ns() * 10.0).round() / 10.0,
+            clock_resolution_ns: clock_resolution_ns(),
+            refused: Vec::new(),
+        };
+        if is_realtime { normal.with_realtime(wait, processors) } else { normal }
+    }
+
+    fn with_realtime(self, wait: Wait, processors: usize) -> Conditions {
+        let priority = may_spin(wait, processors).and_then(|()| take_priority());
+        // Later mappings are not locked: beyond the limit, mapping the topics would fail.
+        let locked = mlockall(MlockAllFlags::CURRENT).map_err(|error| {
+            format!("memory is not locked: {}; `ulimit -l unlimited` permits it", io::Error::from(error))
+        });
+        Conditions {
+            realtime: priority.is_ok(),
+            memory_locked: locked.is_ok(),
+            refused: [priority.err(), locked.err()].into_iter().flatten().collect(),
+            ..self
+        }
+    }
+
+    /// Writes the conditions for users.
+    fn text(&self, notes: &mut Output<'_>) -> Result<(), End> {
+        notes.line(|line| {
+            let priority = if self.realtime { "real-time priority" } else { "normal priority" };
+            let locked = if self.memory_locked { "locked" } else { "not locked" };
+            write!(line, "wait by {}, {priority}, memory {locked}; ", self.wait)?;
+            write!(line, "the clock takes {} ns to read, ", self.clock_read_ns)?;
+            write!(line, "its resolution is {} ns", self.clock_resolution_ns)
+        })?;
+        self.refused.iter().try_for_each(|refused| notes.line(|line| write!(line, "{refused}")))
+    }
+}
+
+/// Refuses priority for a thread that never sleeps, unless the hub has its own processor.
+fn may_spin(wait: Wait, processors: usize) -> Result<(), String> {
+    if wait == Wait::Spin && processors < MIN_PROCESSORS {
+        return Err(format!(
+            "no real-time priority: on {processors} processors it would keep the hub from running while it spins"
+        ));
+    }
+    Ok(())
+}
+
+/// One for the thread that spins, one for the hub, and one for everything else.
+const MIN_PROCESSORS: usize = 3;
+
+/// Takes the lowest real-time priority for the calling thread, or returns the reason and a remedy.
+fn take_priority() -> Result<(), String> {
+    let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, fifo).map_err(|error| {
+        let why = match error {
+            Error::OS(number) => io::Error::from_raw_os_error(number).to_string(),
+            other => format!("{other:?}"),
+        };
+        format!("no real-time priority: {why}; `ulimit -r 1` or CAP_SYS_NICE permits it")
+    })
+}
+
+/// Measures the time that one read of the clock takes, in ns: the best of several runs, which was not interrupted.
+fn clock_read_ns() -> f64 {
+    const RUNS: usize = 8;
+    const READS: u32 = 256;
+    let run = || {
+        let begin = clock::now_ns();
+        for _ in 1..READS {
+            std::hint::black_box(clock::now_ns());
+        }
+        (clock::now_ns() - begin) as f64 / f64::from(READS)
+    };
+    (0..RUNS).map(|_| run()).fold(f64::INFINITY, f64::min)
+}
+
+fn clock_resolution_ns() -> u64 {
+    let Timespec { tv_sec, tv_nsec } = clock_getres(ClockId::Monotonic);
+    tv_sec as u64 * 1_000_000_000 + tv_nsec as u64
+}
+
 #[cfg(test)]
 mod tests {
     use scanhub_schema::Header;
@@ -366,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn as_an_object() {
+    fn writes_result_as_object() {
         let (name, spans) = measured();
         let line = serde_json::to_string(&result(&name, &spans)).expect("an object");
         let begin = r#"{"class":"latency","sensor":"front","topic":"scan","received":4,"before":1,"ahead":0,"flags":["simulated"],"age":{"count":3,"min_ns":1500,"p50_ns":1600,"p90_ns":15000,"p99_ns":15000,"p999_ns":15000,"max_ns":15000},"line":{"count":3,"#;
@@ -376,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_silence_it_is_said_where_the_reason_stands() {
+    fn names_command_that_shows_reason_for_silence() {
         for (topic, verb) in [("front/scan", "info front"), ("robot/zones", "info")] {
             let (name, spans) = (TopicName::parse(topic).expect("a topic"), Spans::new());
             let (mut line, mut text) = (Vec::new(), Vec::new());
@@ -389,7 +499,7 @@ mod tests {
     }
 
     #[test]
-    fn as_a_table() {
+    fn writes_result_as_table() {
         let (name, spans) = measured();
         let mut text = Vec::new();
         full(&mut Output::new(&mut text), &name, &spans, true).expect("written");
@@ -417,5 +527,22 @@ front/scan: simulated
         brief(&mut line, &name, &spans).expect("written");
         let line = String::from_utf8(line).expect("text");
         assert_eq!(line, "front/scan             3 age p50       1.6 p99      15.0 max      15.0 us");
+    }
+    #[test]
+    fn spinning_thread_leaves_the_hub_a_processor() {
+        for wait in [Wait::Doorbell, Wait::Event] {
+            assert_eq!(may_spin(wait, 1), Ok(()));
+        }
+        assert_eq!(may_spin(Wait::Spin, 3), Ok(()));
+        assert!(may_spin(Wait::Spin, 2).is_err_and(|why| why.contains("on 2 processors")));
+    }
+
+    #[test]
+    fn explains_refused_requests() {
+        // On a separate thread, because a thread keeps its priority.
+        let take = || Conditions::take(Wait::Spin, false).with_realtime(Wait::Spin, 2);
+        let taken = thread::spawn(take).join().expect("no panic");
+        assert!(!taken.realtime);
+        assert_eq!(taken.refused.len(), 1 + usize::from(!taken.memory_locked), "{taken:?}");
     }
 }

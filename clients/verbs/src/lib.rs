@@ -15,7 +15,6 @@ pub mod json;
 pub mod latency;
 pub mod leds;
 pub mod list;
-pub mod lossy_writer;
 pub mod names;
 pub mod output;
 mod receive_stats;

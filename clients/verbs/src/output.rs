@@ -1,17 +1,21 @@
-//! Lines on stdout and stderr: each is written with one call, so that a killed verb loses none. A closed reader ends
-//! the verb quietly. Refuses to know what the lines say.
+//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb whose reader
+//! closes the output ends without an error.
 
 use std::io::{self, ErrorKind, Write};
+use std::os::fd::AsFd;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_schema::{Failure, Kind, escape_json};
 use serde::Serialize;
 
-/// Why a verb ended early.
+/// Reason for the early end of a verb.
 #[derive(Debug)]
 pub enum End {
     /// The reader of the output closed it.
     ReaderGone,
-    /// It failed.
+    /// The verb failed.
     Failure(Failure),
 }
 
@@ -30,11 +34,12 @@ impl From<io::Error> for End {
     }
 }
 
-/// Makes a success of a reader that went away: `scanhub echo front/scan | head` is normal use.
+/// Converts the end of a verb to its result. A reader that closes the output is normal use, as in
+/// `scanhub echo front/scan | head`.
 ///
 /// # Errors
 ///
-/// What else it ended by.
+/// Returns the failure of any other end.
 pub fn quiet(result: Result<(), End>) -> Result<(), Failure> {
     match result {
         Ok(()) | Err(End::ReaderGone) => Ok(()),
@@ -42,23 +47,23 @@ pub fn quiet(result: Result<(), End>) -> Result<(), Failure> {
     }
 }
 
-/// Writes whole lines; the buffer is used again and again.
+/// Writer of whole lines. It reuses its buffer.
 pub struct Output<'a> {
     out: &'a mut dyn Write,
     line: Vec<u8>,
 }
 
 impl<'a> Output<'a> {
-    /// Makes an output of lines to `out`.
+    /// Creates an output of lines to `out`.
     pub fn new(out: &'a mut dyn Write) -> Output<'a> {
         Output { out, line: Vec::with_capacity(8192) }
     }
 
-    /// Writes a line of JSON, which a terminal does not obey either.
+    /// Writes a JSON line. Its control characters are escaped, so they have no effect on a terminal.
     ///
     /// # Errors
     ///
-    /// As [`End`] says.
+    /// Returns [`End`] if the line cannot be written.
     pub fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
         self.line.clear();
         serde_json::to_writer(&mut self.line, value).map_err(io::Error::from)?;
@@ -66,12 +71,12 @@ impl<'a> Output<'a> {
         self.end()
     }
 
-    /// Writes a line of text that `build` makes, without its end. What would move a terminal's cursor or change its colours is
-    /// shown as `?`: ports, types and errors may come from another machine.
+    /// Writes the line of text that `build` makes without a line feed. Control characters, which move a terminal's cursor or
+    /// change its colors, become `?`: ports, types and errors may come from another machine.
     ///
     /// # Errors
     ///
-    /// As [`End`] says, and what `build` says.
+    /// Returns the error of `build`, and [`End`] if the line cannot be written.
     pub fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
         self.line.clear();
         build(&mut self.line)?;
@@ -79,7 +84,11 @@ impl<'a> Output<'a> {
         self.end()
     }
 
-    /// Bytes as they are.
+    /// Writes `bytes` unchanged.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`End`] if they cannot be written.
     pub fn raw(&mut self, bytes: &[u8]) -> Result<(), End> {
         self.out.write_all(bytes)?;
         Ok(self.out.flush()?)
@@ -92,14 +101,13 @@ impl<'a> Output<'a> {
     }
 }
 
-/// Puts `?` in place of each byte of the control characters of UTF-8 `text`: C0, DEL and C1 (ECMA-48); a blank for a new
-/// line.
+/// Replaces each byte of a control character in UTF-8 `text` by `?`: C0, DEL and C1 (ECMA-48). A line feed becomes a space.
 fn disarm(text: &mut [u8]) {
     let mut before = 0;
     for at in 0..text.len() {
         let byte = text[at];
         if byte == b'\n' {
-            // A message and its remedy are told in one line.
+            // A message and its remedy are in one line.
             text[at] = b' ';
         } else if byte < 0x20 || byte == 0x7f {
             text[at] = b'?';
@@ -110,7 +118,11 @@ fn disarm(text: &mut [u8]) {
     }
 }
 
-/// Writes `rows` as columns, each as wide as its widest cell; numbers to the right, for people.
+/// Writes `rows` as columns for users, each as wide as its widest cell. Numbers are aligned to the right.
+///
+/// # Errors
+///
+/// Returns [`End`] if a row cannot be written.
 pub fn table(output: &mut Output<'_>, rows: &[Vec<String>]) -> Result<(), End> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
     let width =
@@ -140,15 +152,15 @@ pub fn colors() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-/// The columns of the terminal that `out` is, if it is one that says so.
+/// Returns the number of columns of the terminal `out`. `None` if it is not a terminal, or has no known size.
 #[cfg(feature = "record")]
-pub fn columns(out: impl std::os::fd::AsFd) -> Option<usize> {
+pub fn columns(out: impl AsFd) -> Option<usize> {
     let size = rustix::termios::tcgetwinsize(out).ok()?;
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// `parts` with two blanks between them, in at most so many `columns`: of those that do not fit the one with the lowest rank
-/// goes first. A number that is cut would be another number. The last one stays, however long.
+/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are left out, the lowest rank
+/// first, because a cut number would read as another number. The last part stays, however long it is.
 #[cfg(feature = "record")]
 pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     let length =
@@ -161,8 +173,65 @@ pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     parts.join("  ")
 }
 
+/// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. It writes each
+/// piece at once or not at all.
+pub struct LossyWriter<'a, W> {
+    to: &'a mut W,
+    /// Whether the verb ends. Then no samples can be delayed, and the writer waits for the reader up to `patience`.
+    stop: &'a AtomicBool,
+    /// Time for which the writer may still wait.
+    patience: Duration,
+}
+
+/// Maximum delay of the end by a reader, over all lines. It is enough for a reader that reads at all.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
+    /// Creates a writer to `to`, which waits for its reader only after `stop` is set.
+    pub fn around(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
+        LossyWriter { to, stop, patience: PATIENCE }
+    }
+
+    /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free, which is
+    /// more than a line has (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
+    fn has_room(&mut self) -> bool {
+        let patience = if self.stop.load(Ordering::Relaxed) { self.patience } else { Duration::ZERO };
+        let began = Instant::now();
+        let timeout =
+            Timespec { tv_sec: patience.as_secs() as i64, tv_nsec: i64::from(patience.subsec_nanos()) };
+        let ready = poll(&mut [PollFd::new(&*self.to, PollFlags::OUT)], Some(&timeout));
+        if !patience.is_zero() {
+            self.patience = patience.saturating_sub(began.elapsed());
+        }
+        ready.is_ok_and(|count| count > 0)
+    }
+}
+
+impl<W: Write + AsFd> Write for LossyWriter<'_, W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if !self.has_room() {
+            return Ok(bytes.len());
+        }
+        match self.to.write(bytes) {
+            // Another process may have made the descriptor nonblocking.
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(bytes.len()),
+            // A log on a full disk must not end the verb.
+            Err(error) if error.kind() != ErrorKind::BrokenPipe && !self.stop.load(Ordering::Relaxed) => {
+                Ok(bytes.len())
+            }
+            other => other,
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.to.flush()
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use std::io::Read;
+
     use super::*;
 
     fn line(text: &str) -> String {
@@ -172,14 +241,14 @@ mod tests {
     }
 
     #[test]
-    fn text_does_not_command_a_terminal() {
+    fn replaces_control_characters_in_text() {
         assert_eq!(line("\x1b[2J a\rb\nc\td \x7f"), "?[2J a?b c?d ?\n");
         assert_eq!(line("\u{80}x\u{9b}31m\u{9f}"), "??x??31m??\n");
         assert_eq!(line("/dev/ttyUSB0 \u{a0}20 °C ● Größe"), "/dev/ttyUSB0 \u{a0}20 °C ● Größe\n");
     }
 
     #[test]
-    fn json_says_what_is_there() {
+    fn escapes_control_characters_in_json() {
         let mut out = Vec::new();
         Output::new(&mut out).json(&"\x1b[2J\n\u{9b}2J").unwrap();
         assert_eq!(out, b"\"\\u001b[2J\\n\\u009b2J\"\n");
@@ -187,7 +256,7 @@ mod tests {
 
     #[cfg(feature = "record")]
     #[test]
-    fn what_does_not_fit_goes_whole() {
+    fn leaves_out_whole_parts_that_do_not_fit() {
         let parts = || [(2, "0:00:10"), (0, "6.0 KiB/s"), (1, "903 samples"), (3, "0 lost")];
         let in_columns =
             |columns| fitting(parts().map(|(rank, part)| (rank, part.to_owned())).into(), columns);
@@ -196,5 +265,46 @@ mod tests {
         assert_eq!(in_columns(27), "0:00:10  0 lost");
         assert_eq!(in_columns(14), "0 lost");
         assert_eq!(in_columns(1), "0 lost");
+    }
+
+    #[test]
+    fn drops_whole_lines_without_room() {
+        let (mut reader, mut writer) = io::pipe().unwrap();
+        let stop = AtomicBool::new(false);
+        let mut lossy = LossyWriter::around(&mut writer, &stop);
+        let line = [b'x'; 1000];
+        for _ in 0..1000 {
+            lossy.write_all(&line).unwrap();
+        }
+        // At the end, the writer waits once.
+        stop.store(true, Ordering::Relaxed);
+        for _ in 0..1000 {
+            lossy.write_all(&line).unwrap();
+        }
+        assert_eq!(lossy.patience, Duration::ZERO);
+        drop(writer);
+        let mut all = Vec::new();
+        reader.read_to_end(&mut all).unwrap();
+        assert!(all.len() >= line.len() && all.len() < 1000 * line.len(), "{}", all.len());
+        assert_eq!(all.len() % line.len(), 0);
+    }
+
+    #[test]
+    fn reports_full_disk_of_log_at_end() {
+        let mut full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+        let stop = AtomicBool::new(false);
+        let mut lossy = LossyWriter::around(&mut full, &stop);
+        lossy.write_all(b"x").unwrap();
+        stop.store(true, Ordering::Relaxed);
+        assert_eq!(lossy.write_all(b"x").unwrap_err().kind(), ErrorKind::StorageFull);
+    }
+
+    #[test]
+    fn reports_closed_reader() {
+        let (reader, mut writer) = io::pipe().unwrap();
+        drop(reader);
+        let stop = AtomicBool::new(false);
+        let error = LossyWriter::around(&mut writer, &stop).write_all(b"x").unwrap_err();
+        assert_eq!(error.kind(), ErrorKind::BrokenPipe);
     }
 }

@@ -40,9 +40,8 @@ use self::queue::{Entry, Gap, News, Queue, WriterProgress};
 use self::report::{Look, Report};
 use crate::context::Context;
 use crate::follow::{Bounds, Event, Following};
-use crate::lossy_writer::LossyWriter;
 use crate::names::{Selection, TopicName};
-use crate::output::{End, quiet};
+use crate::output::{End, LossyWriter, quiet};
 use crate::receive_stats::ReceiveStats;
 
 /// Record what the hub publishes in MCAP files
