@@ -17,7 +17,9 @@ mod shell;
 
 use std::path::PathBuf;
 
-use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::parser::ValueSource;
+use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use scanhub_network as network;
 use scanhub_perception::verbs as perception;
 use scanhub_schema::{Failure, Family};
@@ -41,12 +43,28 @@ pub(crate) struct Cli {
 }
 
 impl Cli {
-    /// The command line of this process.
+    /// Parses the command line of this process.
     pub(crate) fn of_process() -> Result<Cli, clap::Error> {
         let mut command = Cli::command();
         let matches = command.try_get_matches_from_mut(std::env::args_os())?;
+        if let Some(("demo", _)) = matches.subcommand() {
+            refuse_hub(&mut command, &matches)?;
+        }
         Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
     }
+}
+
+/// Returns an error if the command line of `demo` names a hub. A domain in the environment names the user's usual hub, so `demo`
+/// ignores it.
+fn refuse_hub(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::Error> {
+    let is_given = |id: &&str| matches.value_source(id) == Some(ValueSource::CommandLine);
+    let Some(id) = ["domain", "root"].into_iter().find(is_given) else { return Ok(()) };
+    let message = format!(
+        "demo runs its own hub in its own domain, and cannot be used with --{id}\n\n  \
+         tip: leave out --{id}; demo shows the name of its domain"
+    );
+    let command = command.find_subcommand_mut("demo").expect("a verb");
+    Err(command.error(ErrorKind::ArgumentConflict, message))
 }
 
 /// Options of all verbs.
@@ -137,8 +155,6 @@ pub(crate) fn family(text: &str) -> Result<Family, String> {
 
 #[cfg(test)]
 mod tests {
-    use clap::{ArgMatches, Command};
-
     use super::*;
 
     /// Returns how this program parses its first command line in `line`.

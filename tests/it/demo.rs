@@ -145,6 +145,27 @@ fn where_the_users_own_place_is_too_long_for_a_domain() {
     accounts_for_all(&outcome, &["front", "rear"]);
 }
 
+#[test]
+fn refuses_hub_on_the_command_line_and_ignores_that_of_the_environment() {
+    for option in ["--domain", "--root"] {
+        let refused = demo(&["--headless", "--for", "1s", option, "other"], Program::wait);
+        assert_eq!(refused.code, Some(2), "{refused}");
+        for word in [&format!("cannot be used with {option}")[..], "tip: leave out", "Usage: scanhub demo"] {
+            assert!(refused.errors.contains(word), "no {word:?}: {refused}");
+        }
+        let refused = demo(&[option, "other", "--json"], Program::wait);
+        let line = &refused.of_class("error")[0];
+        assert_eq!((refused.code, &line["kind"]), (Some(2), &"usage".into()), "{refused}");
+        assert!(line["hint"].as_str().is_some_and(|hint| hint.starts_with("leave out")), "{refused}");
+    }
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("SCANHUB_DOMAIN", "other");
+    let outcome = Program::start(command).wait();
+    let ready = &outcome.of_class("ready")[0];
+    assert!(ready["domain"].as_str().is_some_and(|name| name.starts_with("demo-")), "{outcome}");
+    accounts_for_all(&outcome, &["front", "rear"]);
+}
+
 /// A verb of the program in `domain` of a demonstration that runs.
 fn beside(domain: &str, arguments: &[&str]) -> Program {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
