@@ -5,7 +5,6 @@
 mod account;
 mod cast;
 mod stage;
-mod view;
 
 use std::io::Write;
 use std::path::Path;
@@ -24,10 +23,9 @@ use scanhub_viewer::{WatchArgs, can_show_pictures};
 use serde::Serialize;
 use serde_json::Value;
 
-use account::Account;
+use account::{Account, Sensor, counted};
 use cast::{Families, World};
 use stage::{Line, Stage};
-use view::View;
 
 /// Run simulated sensors, the hub and a consumer for each in one terminal
 #[derive(Args, Debug)]
@@ -149,6 +147,100 @@ impl Drop for Raise<'_> {
         self.0.store(true, Ordering::Relaxed);
     }
 }
+
+/// View of a demonstration without pictures: lines for files and pipes, once a second.
+struct View {
+    /// Command that shows a topic in another terminal.
+    attach: String,
+    /// Address of the page.
+    url: Option<String>,
+    /// Time of the next lines, in seconds.
+    next_s: u64,
+}
+
+impl View {
+    fn new(attach: String, url: Option<&str>) -> View {
+        View { attach, url: url.map(str::to_owned), next_s: 0 }
+    }
+
+    /// Writes the counts after `elapsed`, once a second.
+    fn draw(&mut self, out: &mut dyn Write, account: &Account, elapsed: Duration) {
+        if elapsed.as_secs() >= self.next_s {
+            self.next_s = elapsed.as_secs() + 1;
+            let text = self.lines(account, elapsed).join("\n") + "\n\n";
+            let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+        }
+    }
+
+    fn lines(&self, account: &Account, elapsed: Duration) -> Vec<String> {
+        let seconds = elapsed.as_secs();
+        let mut lines = vec![
+            format!(
+                "scanhub demo  {:02}:{:02}   the hub uses {:.1} % of a processor   Ctrl-C quits",
+                seconds / 60,
+                seconds % 60,
+                account.hub_cpu_percent
+            ),
+            self.attach.clone(),
+        ];
+        lines.extend(self.url.iter().map(|url| format!("browser: {url}")));
+        lines.extend(account.news.iter().map(|news| format!("people: {news}")));
+        for sensor in &account.sensors {
+            lines.push(String::new());
+            lines.extend(sensor_lines(sensor));
+        }
+        lines.extend(account.tilted_words());
+        lines
+    }
+}
+
+/// Returns the counts of a sensor and the profile of its scan.
+fn sensor_lines(sensor: &Sensor) -> [String; 3] {
+    // Telegrams on their way are not lost: the simulators are a little ahead of the subscribers.
+    let lost = sensor.lost().saturating_sub(IN_FLIGHT);
+    let nearest = match sensor.nearest_mm {
+        Some(mm) => format!("nearest {:.2} m at {:.1} degrees", mm as f64 / 1000.0, sensor.nearest_deg),
+        None => "nothing seen".to_owned(),
+    };
+    [
+        format!(
+            "{:6} {:9} {:6} Bd  {:>5} Hz   {}   {} lost, {} on the line",
+            sensor.name,
+            sensor.state,
+            sensor.baud,
+            sensor.hz().map_or("-".into(), |hz| format!("{hz:.2}")),
+            counted(sensor.received_count, "telegram"),
+            lost,
+            sensor.lost_on_line().unwrap_or_default(),
+        ),
+        format!("  left  {}  right", profile(sensor)),
+        format!("        {:<COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),
+    ]
+}
+
+/// Returns the scan from left to right. The nearer the nearest beam of a column, the taller its block.
+fn profile(sensor: &Sensor) -> String {
+    if sensor.ranges.is_empty() {
+        return "waiting for the first scan".to_owned();
+    }
+    let beams = sensor.ranges.len();
+    let column = |n: usize| {
+        let nearest = sensor.ranges[n * beams / COLUMNS..(n + 1) * beams / COLUMNS].iter().flatten().min();
+        nearest.map_or(' ', |&mm| {
+            BLOCKS[(BLOCKS.len() - 1) - (mm as usize * BLOCKS.len() / FAR_MM).min(BLOCKS.len() - 1)]
+        })
+    };
+    // Beam 0 is on the right.
+    (0..COLUMNS).rev().map(column).collect()
+}
+
+/// Columns of a profile.
+const COLUMNS: usize = 60;
+const BLOCKS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+/// Range of the lowest block.
+const FAR_MM: usize = 8000;
+/// Maximum number of telegrams on their way at an update.
+const IN_FLIGHT: u64 = 12;
 
 /// Returns the command that shows a topic of the demonstration in another terminal.
 fn attach(stage: &Stage) -> String {

@@ -1,5 +1,5 @@
-//! `scanhub bridge` on the command line: another program, which knows its own arguments. It is one of its own because few
-//! need it, and what it is built of is five times as much as all the rest.
+//! `scanhub bridge`: starts the program scanhub-bridge, which parses its own arguments. It is a separate program because few users
+//! need it, and its dependencies are five times those of everything else.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -27,11 +27,13 @@ Examples:
   scanhub bridge --help";
 
 impl Bridge {
-    /// Becomes the program: the one beside this one, else the one that is found by its name.
+    /// Replaces this process by the program, which is searched first in the directory of this program and then in `PATH`.
     ///
-    /// [`Kind::Configuration`] if there is none, or if it is of another version.
+    /// # Errors
+    ///
+    /// [`Kind::Configuration`] if there is none, if it has another version, or if it cannot be started.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        // In one line: what is wrong, and what to do.
+        // The error and its remedy are in one line.
         let program = find(&places()).map_err(|Failure { kind, message, hint }| {
             Failure::new(kind, format!("{message}; {hint}"), "")
         })?;

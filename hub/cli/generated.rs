@@ -1,5 +1,5 @@
-//! Text that is generated from the definition of the command line: completion scripts for shells, and manual pages. The scripts
-//! call the hidden verb `complete` for the names of the running hub. It prints no errors, because no one reads them while typing.
+//! `scanhub completions` and `scanhub man`: text that is generated from the definition of the command line. The scripts call the
+//! hidden verb `complete` for the names of the running hub. That verb prints no errors, because they would disturb a user who types.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -32,6 +32,10 @@ enum Shell {
 }
 
 impl Completions {
+    /// Prints the script.
+    ///
+    /// # Errors
+    ///
     /// [`Kind::Failed`] if it cannot be written.
     pub(crate) fn run(&self, _: &mut Context) -> Result<(), Failure> {
         let mut text = Vec::new();
@@ -43,7 +47,7 @@ impl Completions {
         }
         let text = String::from_utf8_lossy(&text);
         let text = text.trim_end();
-        // The definition does not know the names of the hub.
+        // The definition does not contain the names of the hub.
         match self.shell {
             Shell::Bash => print_own(&format!("{text}\n{}", BASH.trim_end())),
             // The last lines of the script call functions defined before them.
@@ -94,7 +98,7 @@ impl Complete {
     }
 }
 
-/// Which names of the hub can come next.
+/// Kind of the names of the hub that can come next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Name {
     Sensor,
@@ -112,7 +116,7 @@ struct Line {
 }
 
 impl Line {
-    /// Reads `words`, the program's name first, by the definition `whole`.
+    /// Parses `words`, the program's name first, according to the definition `whole`.
     fn read(whole: &Command, words: &[String]) -> Line {
         let everywhere = Cli::command();
         let mut line = Line::default();
@@ -159,7 +163,7 @@ impl Line {
     }
 }
 
-/// The option that `word` starts with.
+/// Returns the option that `word` starts with.
 fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
     let (bare, _) = word.split_once('=').unwrap_or((word, ""));
     let is_it = |arg: &&Arg| match (bare.strip_prefix("--"), bare.strip_prefix('-')) {
@@ -170,7 +174,7 @@ fn option<'a>(command: &'a Command, word: &str) -> Option<&'a Arg> {
     command.get_arguments().find(is_it)
 }
 
-/// Which name of a hub `arg` takes; its value name tells.
+/// Returns which names of a hub `arg` takes, as its value name states.
 fn name(arg: &Arg) -> Option<Name> {
     let named = arg.get_value_names().and_then(|names| names.first()).map(|name| name.to_string());
     match named.unwrap_or_else(|| arg.get_id().to_string().to_uppercase()).as_str() {
@@ -180,7 +184,7 @@ fn name(arg: &Arg) -> Option<Name> {
     }
 }
 
-/// Appended to the script for bash: what the script knows, and what the hub knows.
+/// Appended to the script for bash: adds the names of the hub to the words of the script.
 const BASH: &str = r#"
 _scanhub_live() {
     _scanhub "$@"
@@ -192,7 +196,7 @@ _scanhub_live() {
 complete -F _scanhub_live -o bashdefault -o default scanhub
 "#;
 
-/// Appended to the script for zsh: replaces file names.
+/// Inserted into the script for zsh: completes names of the hub in place of file names.
 const ZSH: &str = r#"
 _scanhub_live() {
     local -a typed known
@@ -203,7 +207,7 @@ _scanhub_live() {
 }
 "#;
 
-/// Appended to the script for fish.
+/// Appended to the script for fish: adds the names of the hub.
 const FISH: &str = r#"
 complete -c scanhub -a '(set -l typed (commandline -opc); $typed[1] complete -- $typed 2>/dev/null)'
 "#;
@@ -223,6 +227,10 @@ Examples:
   scanhub man ~/.local/share/man/man1";
 
 impl Man {
+    /// Prints the page of the program, or writes all pages.
+    ///
+    /// # Errors
+    ///
     /// [`Kind::Output`] if the directory cannot be written to, [`Kind::Failed`] if stdout cannot.
     pub(crate) fn run(&self, _: &mut Context) -> Result<(), Failure> {
         match &self.directory {
@@ -237,6 +245,7 @@ impl Man {
     }
 }
 
+/// Writes the pages of the program and all verbs to `directory`.
 fn write_pages(directory: &Path) -> Result<(), Failure> {
     output::create_directory(directory)?;
     let mut command = Cli::command().disable_help_subcommand(true);
@@ -267,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn where_a_name_of_the_hub_can_stand() {
+    fn completes_names_of_the_hub_where_a_verb_takes_them() {
         for text in [
             "scanhub echo",
             "scanhub echo front/scan",
@@ -309,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn a_domain_is_heard_however_it_is_written() {
+    fn reads_domain_in_every_notation() {
         for text in ["scanhub --domain x echo", "scanhub echo --domain=x", "scanhub echo --domain = x"] {
             let words: Vec<_> = text.split_whitespace().map(String::from).collect();
             let line = Line::read(&Cli::command(), &words);

@@ -8,5 +8,3 @@ mod driver;
 pub mod probe;
 pub mod telegram;
 mod terminal;
-
-pub use terminal::Progress;

@@ -17,7 +17,7 @@ pub(crate) fn print(
     text: impl FnOnce() -> String,
 ) -> Result<(), Failure> {
     let line = if json { json_line(serde_json::to_string(value).unwrap_or_default()) } else { text() };
-    // One write for each line, so that a killed command loses none.
+    // One write for each line, so that a killed command leaves no partial line.
     match out.write_all(format!("{}\n", Printable(&line)).as_bytes()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
             Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), ""))
@@ -27,20 +27,20 @@ pub(crate) fn print(
 }
 
 /// Progress of a command: one line on stderr that the next text overwrites. Shows no text if stderr is not a terminal.
-pub struct Progress {
+pub(crate) struct Progress {
     is_terminal: bool,
-    /// Whether there is something on the line.
+    /// Whether the line has a text.
     is_shown: bool,
 }
 
 impl Progress {
     /// Creates an empty line.
-    pub fn on_stderr() -> Progress {
+    pub(crate) fn on_stderr() -> Progress {
         Progress { is_terminal: stderr().is_terminal(), is_shown: false }
     }
 
     /// Replaces the line by `text`.
-    pub fn show(&mut self, text: &str) {
+    pub(crate) fn show(&mut self, text: &str) {
         if self.is_terminal {
             let _ = write!(stderr(), "\r\x1b[K{text} ..");
             self.is_shown = true;
@@ -48,14 +48,14 @@ impl Progress {
     }
 
     /// Removes the line.
-    pub fn clear(&mut self) {
+    pub(crate) fn clear(&mut self) {
         if std::mem::take(&mut self.is_shown) {
             let _ = write!(stderr(), "\r\x1b[K");
         }
     }
 
-    /// Keeps the last text on its own line: that step failed, and the reason is printed next.
-    pub fn leave(&mut self) {
+    /// Keeps the last text on its own line, because that step failed and its reason is printed next.
+    pub(crate) fn leave(&mut self) {
         if std::mem::take(&mut self.is_shown) {
             let _ = writeln!(stderr());
         }
