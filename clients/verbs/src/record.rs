@@ -2,12 +2,13 @@
 //!
 //! The path of a sample, from top to bottom:
 //!
-//! 1. The topics: [`RecordArgs::run`] follows the selected ones, and [`Recorder::sample`] receives the sample.
+//! 1. The topics: [`RecordArgs::run`] follows the selected ones, and [`Recorder::run`] receives their samples.
 //! 2. The queue ([`Queue`]) is bounded. A sample that finds no room is left out, counted, reported, and becomes part of a
 //!    [`Gap`] in the file.
 //! 3. The disk thread ([`Disk::run`]) takes the whole queue ten times a second. It alone touches the disk, so a slow, full or
 //!    missing disk does not delay any live topic.
 //! 4. The file ([`Part`](part::Part)) makes a chunk of it and writes it. [`Files`] names the files and removes old ones.
+//! 5. The report ([`Report`]) prints the progress of the disk thread and the result.
 
 mod disk;
 mod files;
@@ -33,7 +34,7 @@ use scanhub_schema::file::Compression;
 use scanhub_schema::{Failure, Kind, Topic};
 use scanhub_shm::Domain;
 
-use self::disk::Disk;
+use self::disk::{Destination, Disk};
 use self::files::{Files, Split};
 use self::part::{Form, Style};
 use self::queue::{Entry, Gap, News, Queue, WriterProgress};
@@ -112,9 +113,9 @@ impl RecordArgs {
         self.output.as_deref() == Some(Path::new("-"))
     }
 
-    /// Records until the bounds are reached or `stop` is set, and then finishes the file. If `stop` is set again meanwhile, the
-    /// run does not wait for that. Progress goes to `out`, or to `notes` (stderr) if stdout carries the recording. Notices go to
-    /// `notes` without `json`. Lines that their reader does not take are left out, so that they do not delay the recording.
+    /// Records until the bounds are reached or a signal arrives, and then finishes the file. Another signal meanwhile ends the run
+    /// at once. Progress goes to stdout, or to stderr if stdout carries the recording. Notices go to stderr without `--json`.
+    /// Lines that their reader does not take are dropped, so that they do not delay the recording.
     ///
     /// # Errors
     ///
@@ -125,97 +126,80 @@ impl RecordArgs {
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         // The file is finished, no matter which signal ends the run.
         let (places, stop) = (context.domain.places()?, context.signals.any_end()?);
-        // If stdout carries the recording, the progress goes to stderr as well.
-        let mut stderr =
-            self.is_to_stdout().then(|| context.notes.try_clone()).transpose().map_err(no_stderr)?;
-        let out = stderr.as_mut().unwrap_or(&mut context.out);
-        let look = match (context.json, out.is_terminal()) {
-            (true, _) => Look::Json,
-            (false, true) => Look::Terminal,
-            (false, false) => Look::Lines,
-        };
+        let stderr = self.is_to_stdout().then(|| context.notes.try_clone()).transpose();
+        let mut stderr = stderr.map_err(no_stderr)?;
         let (names, topics) = selection(&self.topics, self.all, self.ros2)?;
         let queue = Arc::new(Queue::new());
-        let disk = match self.begin(&places, &queue) {
-            Ok(disk) => disk,
-            Err(end) => return quiet(Err(end)),
-        };
-        let (first, older) = (disk.path(), disk.surplus_older());
-        let over = AtomicBool::new(false);
+        let disk = self.create_file(&places, &queue)?;
+        let (file, surplus) = (disk.path(), disk.surplus_older());
+
+        let out = stderr.as_mut().unwrap_or(&mut context.out);
+        let look = Look::of(context.json, out.is_terminal());
         let terminal = out.as_fd().try_clone_to_owned().ok();
-        let (mut out, mut notes) =
-            (LossyWriter::around(out, &over), LossyWriter::around(&mut context.notes, &over));
+        let over = AtomicBool::new(false);
+        let mut out = LossyWriter::around(out, &over);
+        let mut notes = LossyWriter::around(&mut context.notes, &over);
         let mut report = Report::new(look, &mut out, &mut notes, terminal);
-        let begun = report.begin(&first, older);
-        let mut recorder = Recorder {
-            progress: disk.progress(),
-            tracks: Vec::new(),
-            queue: queue.clone(),
-            pushed: 0,
-            left_out: 0,
-            gap: None,
-            tick_at: Instant::now(),
-            report,
-            over: &over,
-        };
-        let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
-        let writing = writing
-            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+        let begun = report.begin(&file, surplus);
+
+        let mut recorder = Recorder::start(queue, disk, report, &over)?;
         let mut following = Following::new(&names, &topics, &places, &self.bounds, &stop).with_lines();
         let end = begun.and_then(|()| {
             let end = recorder.run(&mut following);
             following.finish(end, |name, stats| recorder.summary(name, stats))
         });
+
         // The recording is kept if the hub or the reader of the lines went away.
         let stays = recorder.pushed > 0 || !matches!(end, Err(End::Failure(_)));
-        let finished = recorder.finish(writing, stays, &stop);
+        let finished = recorder.finish(stays, &stop);
         if !stays && !self.is_to_stdout() {
             // Without the hub or sensor, the run leaves no file.
-            files::discard(&first);
+            files::discard(&file);
         }
         quiet(end).and(quiet(finished))
     }
 
-    /// Starts the first file.
-    fn begin(&self, places: &[Domain], queue: &Arc<Queue>) -> Result<Disk, End> {
+    /// Creates the first file, or takes stdout in its place. Returns the disk thread that writes the samples of `queue` to it.
+    fn create_file(&self, places: &[Domain], queue: &Arc<Queue>) -> Result<Disk, Failure> {
         let wall_ns = clock::wall_ns();
         let default = files::default_name(wall_ns);
         let path = self.output.as_deref().unwrap_or(&default);
-        let failed = |error: io::Error| no_file(path, self.split.is_some(), &error);
-        let files = match self.is_to_stdout() {
-            true if self.split.is_some() => {
-                return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out").into());
-            }
-            true if io::stdout().is_terminal() => {
-                let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
-                return Err(
-                    Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint).into()
-                );
-            }
-            true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
-            false => {
-                let target = Target::open(path)?;
-                // A split run adds numbers to the name.
-                if self.split.is_none() {
-                    target.check(self.force)?;
-                }
-                let run = wall_ns.to_string();
-                Ok(Files::new(
-                    path,
-                    self.split.is_some(),
-                    self.force,
-                    self.keep.map(|keep| keep as usize),
-                    &run,
-                ))
-            }
+        let destination = match self.is_to_stdout() {
+            true => Destination::Stream(self.stdout()?),
+            false => Destination::Files(self.files(path, wall_ns)?),
         };
         let form = if self.ros2 { Form::Ros2 } else { Form::Hub };
         let style = Style { form, compression: self.compression };
-        let begun = Disk::begin(queue.clone(), files, self.split, style, facts(places, wall_ns));
-        begun.map_err(|error| match error.kind() {
-            ErrorKind::BrokenPipe => reader_gone(0).into(),
-            _ => failed(error).into(),
+        let disk = Disk::begin(queue.clone(), destination, self.split, style, facts(places, wall_ns));
+        disk.map_err(|error| match error.kind() {
+            ErrorKind::BrokenPipe => reader_gone(0),
+            _ => no_file(path, self.split.is_some(), &error),
         })
+    }
+
+    /// Returns the files of a run that starts at `wall_ns`, the first of which is called `path`.
+    fn files(&self, path: &Path, wall_ns: u64) -> Result<Files, Failure> {
+        let target = Target::open(path)?;
+        // A split run adds numbers to the name.
+        let is_split = self.split.is_some();
+        if !is_split {
+            target.check(self.force)?;
+        }
+        let keep = self.keep.map(|keep| keep as usize);
+        Ok(Files::new(path, is_split, self.force, keep, &wall_ns.to_string()))
+    }
+
+    /// Returns stdout as a file.
+    fn stdout(&self) -> Result<File, Failure> {
+        if self.split.is_some() {
+            return Err(Failure::new(Kind::Usage, "stdout cannot be split", "leave --split out"));
+        }
+        if io::stdout().is_terminal() {
+            let hint = "for example `scanhub record -o - | ssh host 'cat > walk.mcap'`";
+            return Err(Failure::new(Kind::Usage, "a recording cannot be written to a terminal", hint));
+        }
+        let stdout = io::stdout().as_fd().try_clone_to_owned();
+        stdout.map(File::from).map_err(|error| no_file(Path::new("-"), false, &error))
     }
 }
 
@@ -282,8 +266,10 @@ fn facts(places: &[Domain], wall_ns: u64) -> BTreeMap<String, String> {
     facts.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
+/// Receiving side of a run: passes samples to the queue, and reports what the disk thread does.
 struct Recorder<'a> {
     queue: Arc<Queue>,
+    writing: JoinHandle<io::Result<()>>,
     progress: Arc<WriterProgress>,
     /// Topics of the recording, by their numbers in the queue.
     tracks: Vec<TopicName>,
@@ -298,7 +284,33 @@ struct Recorder<'a> {
     over: &'a AtomicBool,
 }
 
-impl Recorder<'_> {
+impl<'a> Recorder<'a> {
+    /// Starts the disk thread.
+    fn start(
+        queue: Arc<Queue>,
+        disk: Disk,
+        report: Report<'a>,
+        over: &'a AtomicBool,
+    ) -> Result<Recorder<'a>, Failure> {
+        let progress = disk.progress();
+        let writing = thread::Builder::new().name("disk".into()).spawn(move || disk.run());
+        let writing = writing
+            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), "see `ulimit -u`"))?;
+        Ok(Recorder {
+            queue,
+            writing,
+            progress,
+            tracks: Vec::new(),
+            pushed: 0,
+            left_out: 0,
+            gap: None,
+            tick_at: Instant::now(),
+            report,
+            over,
+        })
+    }
+
+    /// Passes samples on until the run ends.
     fn run(&mut self, following: &mut Following<'_>) -> Result<(), End> {
         while let Some(event) = following.next(None)? {
             match event {
@@ -318,6 +330,7 @@ impl Recorder<'_> {
         Ok(())
     }
 
+    /// Passes `sample` to the disk thread. After a gap, it first waits until there is room for many samples.
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         let Some(header) = sample.header() else { return Ok(()) };
         if self.gap.is_some() {
@@ -357,6 +370,7 @@ impl Recorder<'_> {
         told
     }
 
+    /// Reports progress and news of the disk thread.
     fn look(&mut self) -> Result<(), End> {
         let stats = self.progress.look();
         for news in stats.news.iter() {
@@ -368,6 +382,7 @@ impl Recorder<'_> {
         self.report.progress(&stats, self.left_out)
     }
 
+    /// Reports what was received of a topic, at the end of the run.
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {
         self.over.store(true, Ordering::Relaxed);
         self.report.topic(name, stats)
@@ -375,25 +390,21 @@ impl Recorder<'_> {
 
     /// Waits until everything is written, and reports the result if the recording `stays`. A second request to stop ends the
     /// wait.
-    fn finish(
-        mut self,
-        writing: JoinHandle<io::Result<()>>,
-        stays: bool,
-        stop: &AtomicBool,
-    ) -> Result<(), End> {
+    fn finish(mut self, stays: bool, stop: &AtomicBool) -> Result<(), End> {
         self.over.store(true, Ordering::Relaxed);
         stop.store(false, Ordering::Relaxed);
         let told = self.end_gap();
         self.queue.end();
         let mut second = SecondStop::default();
-        while !writing.is_finished() {
+        while !self.writing.is_finished() {
             if second.poll(stop.swap(false, Ordering::Relaxed)) {
                 let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
             thread::sleep(LOOK_INTERVAL);
         }
-        let written = writing.join().unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
+        let written = self.writing.join();
+        let written = written.unwrap_or_else(|_| Err(io::Error::other("the writing thread panicked")));
         let stats = self.progress.look();
         if let Err(error) = written {
             if error.kind() == ErrorKind::BrokenPipe {
@@ -474,7 +485,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_second_request_to_stop_comes_later_than_the_signals_of_the_first() {
+    fn distinguishes_second_request_from_signals_of_the_first() {
         let mut second = SecondStop::default();
         // A signal at every poll, however long each of them takes.
         assert!((0..SecondStop::SAME_REQUEST).all(|_| !second.poll(true)));
@@ -490,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_usual_and_everything() {
+    fn selects_default_named_and_all_topics() {
         assert_eq!(selected(&[], false, false).unwrap().1, DEFAULT_TOPICS);
         assert_eq!(selected(&[], true, false).unwrap().1, Topic::ALL);
         let some = selected(&["front/scan", "*/status", "front/scan"], false, false).unwrap();
@@ -498,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn ros_takes_scans_and_where_their_sensors_sit() {
+    fn selects_scans_and_poses_for_ros() {
         let ours = [Topic::Scan, Topic::Status];
         assert_eq!(selected(&[], false, true).unwrap().1, ours);
         assert_eq!(selected(&["*/scan"], false, true).unwrap().1, ours);
@@ -512,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_topic_is_refused() {
+    fn refuses_topics_that_do_not_exist() {
         let kind = |text| selected(&[text], false, false).map(drop).map_err(|failure| failure.kind);
         for bad in ["front", "*/scam", "front/scam", "robot/scan", "*", "robot/zones", "Front/scan"] {
             assert_eq!(kind(bad), Err(Kind::Usage), "{bad}");

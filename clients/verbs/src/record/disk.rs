@@ -45,21 +45,29 @@ struct Trouble {
     is_too_large: bool,
 }
 
+/// Place of a recording.
+pub(super) enum Destination {
+    /// Files, of which the next one is started if the current one is full or fails.
+    Files(Files),
+    /// A stream, such as stdout.
+    Stream(File),
+}
+
 impl Disk {
-    /// Starts the first file, or the stream instead of files. An error at the start ends the run at once.
+    /// Starts the first file, or the stream. An error at the start ends the run at once.
     pub(super) fn begin(
         queue: Arc<Queue>,
-        files: Result<Files, File>,
+        destination: Destination,
         split: Option<Split>,
         style: Style,
         facts: BTreeMap<String, String>,
     ) -> io::Result<Disk> {
-        let (files, place) = match files {
-            Ok(mut files) => {
+        let (files, place) = match destination {
+            Destination::Files(mut files) => {
                 let (path, file) = files.first()?;
                 (Some(files), Place::File(file, path))
             }
-            Err(stream) => (None, Place::Stream(stream)),
+            Destination::Stream(stream) => (None, Place::Stream(stream)),
         };
         let mut part = Part::begin(place, style, numbered(&facts, files.as_ref()))?;
         // A file that could not be started must not block the next try.
@@ -85,6 +93,7 @@ impl Disk {
         })
     }
 
+    /// Returns the progress, which the disk thread updates.
     pub(super) fn progress(&self) -> Arc<WriterProgress> {
         self.progress.clone()
     }
@@ -313,7 +322,9 @@ mod tests {
         let place = TempDir::new().unwrap();
         let files = Files::new(&place.path().join("walk.mcap"), split.is_some(), false, None, "");
         let style = Style { form: Form::Hub, compression: Compression::None };
-        let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, style, BTreeMap::new()).unwrap();
+        let disk =
+            Disk::begin(Arc::new(Queue::new()), Destination::Files(files), split, style, BTreeMap::new());
+        let disk = disk.unwrap();
         for sensor in sensors {
             let name = TopicName { sensor: (*sensor).to_owned(), topic: Topic::Status };
             disk.queue.note(Entry::Track(name));
@@ -335,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_in_which_nothing_came_lasts() {
+    fn keeps_file_without_samples_open() {
         let hour = Duration::from_secs(3600);
         let (place, mut disk) = disk(Some(Split::Time(hour)), &["front"]);
         let now = Instant::now();
@@ -350,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn keeps_one_file_where_one_is_wanted() {
+    fn keeps_one_file_if_configured() {
         let (place, mut disk) = disk(None, &["front"]);
         disk.files = Some(Files::new(&place.path().join("run.mcap"), true, false, Some(1), "run 1"));
         disk.facts.insert("started_ns".to_owned(), "run 1".to_owned());
@@ -365,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn an_index_that_grew_too_large_ends_a_file() {
+    fn starts_next_file_if_index_is_too_large() {
         let (place, mut disk) = disk(None, &["front"]);
         disk.most_index = 1000;
         for _ in 0..9 {
@@ -376,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_sensor_said_that_is_gone_is_not_said_again() {
+    fn does_not_repeat_status_of_missing_sensor() {
         let (_place, mut disk) = disk(None, &["front", "rear"]);
         (0..2).for_each(|track| push(&disk, track));
         disk.step(Instant::now(), false).unwrap();
@@ -393,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_was_cut_is_lost() {
+    fn detects_file_that_was_cut() {
         let (place, mut disk) = disk(None, &["front"]);
         push(&disk, 0);
         disk.step(Instant::now(), false).unwrap();

@@ -26,6 +26,17 @@ pub(super) enum Look {
     Terminal,
 }
 
+impl Look {
+    /// Returns the form of reports for this output.
+    pub(super) fn of(is_json: bool, is_terminal: bool) -> Look {
+        match (is_json, is_terminal) {
+            (true, _) => Look::Json,
+            (false, true) => Look::Terminal,
+            (false, false) => Look::Lines,
+        }
+    }
+}
+
 /// Reports of a run, and the counts in them.
 pub(super) struct Report<'a> {
     look: Look,
@@ -49,7 +60,7 @@ pub(super) struct Report<'a> {
 const EVERY: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Reports go to `out`, which may be `terminal`, and notices to `notes` if `out` is not JSON.
+    /// Creates the reports of a run. They go to `out`, which may be `terminal`, and notices to `notes` if `out` is not JSON.
     pub(super) fn new(
         look: Look,
         out: &'a mut dyn Write,
