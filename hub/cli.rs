@@ -54,8 +54,8 @@ impl Cli {
     }
 }
 
-/// Returns an error if the command line of `demo` names a hub. A domain in the environment names the user's usual hub, so `demo`
-/// ignores it.
+/// Returns an error if the command line of `demo` names a hub. A domain in the environment names the user's usual hub,
+/// so `demo` ignores it.
 fn refuse_hub(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::Error> {
     let is_given = |id: &&str| matches.value_source(id) == Some(ValueSource::CommandLine);
     let Some(id) = ["domain", "root"].into_iter().find(is_given) else { return Ok(()) };

@@ -1,5 +1,5 @@
-//! `scanhub bridge`: starts the program scanhub-bridge, which parses its own arguments. It is a separate program because few users
-//! need it, and its dependencies are five times those of everything else.
+//! `scanhub bridge`: starts the program scanhub-bridge, which parses its own arguments. It is a separate program
+//! because few users need it, and its dependencies are five times those of everything else.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -27,7 +27,8 @@ Examples:
   scanhub bridge --help";
 
 impl Bridge {
-    /// Replaces this process by the program, which is searched first in the directory of this program and then in `PATH`.
+    /// Replaces this process by the program, which is searched first in the directory of this program and then in
+    /// `PATH`.
     ///
     /// # Errors
     ///

@@ -1,5 +1,6 @@
-//! `scanhub completions` and `scanhub man`: text that is generated from the definition of the command line. The scripts call the
-//! hidden verb `complete` for the names of the running hub. That verb prints no errors, because they would disturb a user who types.
+//! `scanhub completions` and `scanhub man`: text that is generated from the definition of the command line. The scripts
+//! call the hidden verb `complete` for the names of the running hub. That verb prints no errors, because they would
+//! disturb a user who types.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};

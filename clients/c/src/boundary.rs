@@ -1,5 +1,5 @@
-//! The boundary to C: addresses from C as Rust references, the sample that C sees, and the error of a call. All unsafe code of
-//! this crate is here.
+//! The boundary to C: addresses from C as Rust references, the sample that C sees, and the error of a call. All unsafe
+//! code of this crate is here.
 #![allow(unsafe_code)]
 
 use std::cell::RefCell;
@@ -53,8 +53,8 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
     if address.is_null() {
         return Ok(None);
     }
-    // SAFETY: it is not NULL, and the header requires a text that ends with 0 and does not change during the call. No caller in
-    // this crate keeps it longer.
+    // SAFETY: it is not NULL, and the header requires a text that ends with 0 and does not change during the call. No
+    // caller in this crate keeps it longer.
     let text = unsafe { CStr::from_ptr(address) };
     let not_text = CallError::Argument("a name is not UTF-8", "names are made of a-z, 0-9, _ and -");
     text.to_str().map(Some).map_err(|_| not_text)
@@ -63,15 +63,16 @@ pub(crate) fn text<'a>(address: *const c_char) -> Result<Option<&'a str>, CallEr
 /// Returns the memory for an output argument. Its old content may be anything.
 pub(crate) fn place<'a, T>(address: *mut T) -> Result<&'a mut MaybeUninit<T>, CallError> {
     check(address)?;
-    // SAFETY: it is not NULL and aligned, and the header requires room for one T that only the library uses during the call. No
-    // caller in this crate keeps it longer.
+    // SAFETY: it is not NULL and aligned, and the header requires room for one T that only the library uses during the
+    // call. No caller in this crate keeps it longer.
     unsafe { address.cast::<MaybeUninit<T>>().as_mut() }.ok_or(NULL)
 }
 
 /// Returns a sample that an earlier call filled.
 pub(crate) fn sample<'a>(address: *mut Lent) -> Result<&'a mut Lent, CallError> {
     check(address)?;
-    // SAFETY: as in `place`. The header requires a sample that was taken or zeroed, and every value of a field is valid.
+    // SAFETY: as in `place`. The header requires a sample that was taken or zeroed, and every value of a field is
+    // valid.
     unsafe { address.as_mut() }.ok_or(NULL)
 }
 

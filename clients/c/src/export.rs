@@ -106,7 +106,8 @@ pub extern "C" fn scanhub_release(taken: *mut Lent) -> c_int {
     answer(|| {
         let taken = sample(taken)?;
         let Lent { of, number, .. } = *taken;
-        // A sample that was released or never filled needs nothing. After an error, the thread that took it still has it.
+        // A sample that was released or never filled needs nothing. After an error, the thread that took it still has
+        // it.
         if !of.is_null() {
             with(of, |handle: &mut Handle| handle.give_back(number))?;
         }

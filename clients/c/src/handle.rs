@@ -1,9 +1,9 @@
-//! Objects behind the handles of a C program, and the table of the handles of a thread. An object is a subscription to any topic,
-//! with the samples that are lent to the program, or a mount whose angles the program publishes.
+//! Objects behind the handles of a C program, and the table of the handles of a thread. An object is a subscription to
+//! any topic, with the samples that are lent to the program, or a mount whose angles the program publishes.
 //!
-//! A handle is a number that looks like an address. The table looks up each number that C passes, and never dereferences it. A
-//! child after `fork` has a copy of the table and never uses it, because the samples and the slots at the hub belong to the
-//! parent.
+//! A handle is a number that looks like an address. The table looks up each number that C passes, and never
+//! dereferences it. A child after `fork` has a copy of the table and never uses it, because the samples and the slots
+//! at the hub belong to the parent.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -329,8 +329,8 @@ thread_local! {
 struct Entry {
     number: usize,
     process: u32,
-    /// Boxed, because the samples that an object lends must not move when the table grows. `None` only while the entry is
-    /// dropped.
+    /// Boxed, because the samples that an object lends must not move when the table grows. `None` only while the entry
+    /// is dropped.
     object: Option<Box<dyn Any>>,
 }
 

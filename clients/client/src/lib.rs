@@ -1,9 +1,10 @@
-//! The client library: subscribes to the topics of a hub, and publishes topics next to those of the hub. A program needs no other
-//! crate.
+//! The client library: subscribes to the topics of a hub, and publishes topics next to those of the hub. A program
+//! needs no other crate.
 //!
-//! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after restarts of the
-//!   hub.
-//! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is [`Verdict::Unknown`].
+//! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after
+//!   restarts of the hub.
+//! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
+//!   [`Verdict::Unknown`].
 //! - [`publish`] creates a topic for other programs.
 //! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
 //! - [`streams`] is for programs that follow many topics in one thread.
@@ -56,8 +57,8 @@ pub use scanhub_schema::{
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 
-/// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for programs that
-/// need more than a [`Subscription`].
+/// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for
+/// programs that need more than a [`Subscription`].
 ///
 /// # Examples
 ///

@@ -69,9 +69,9 @@ pub struct GatewayArgs {
 }
 
 impl GatewayArgs {
-    /// Sends until `stop` is set, even without hub or network. The counters go to `out` at the end and whenever `tell`
-    /// is set, and everything else to `notes` (stderr) if `out` is not JSON. Lines for which there is no room are
-    /// dropped, so that a slow reader delays only the end, by a second.
+    /// Sends until a signal stops it, even without hub or network. The counters go to stdout at the end and after each
+    /// SIGUSR1, and everything else to stderr without `--json`. Lines for which there is no room are dropped, so that a
+    /// slow reader delays only the end, by a second.
     ///
     /// # Errors
     ///
@@ -82,7 +82,7 @@ impl GatewayArgs {
     /// - [`Kind::Usage`] if there is no such topic,
     /// - [`Kind::NoTopic`] if the first hub has no such sensor,
     /// - [`Kind::Short`] if descriptors or memory are short,
-    /// - [`Kind::Interrupted`] if `stop` is set before all hosts are resolved.
+    /// - [`Kind::Interrupted`] if a signal stops the run before all hosts are resolved.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
         let display = match (context.json, context.is_terminal) {

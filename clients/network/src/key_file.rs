@@ -36,7 +36,7 @@ enum KeyCommand {
 }
 
 impl KeyArgs {
-    /// Runs the command, which prints to `out`.
+    /// Creates a key file, and prints the name of its key.
     ///
     /// # Errors
     ///

@@ -78,9 +78,8 @@ Example:
 SIGUSR1: print the counts so far";
 
 impl ListenArgs {
-    /// Prints received samples to `out`, and the counters at the end and whenever `tell` is set. Everything else goes
-    /// to `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached, `stop` is set, or the reader has
-    /// closed the output.
+    /// Prints received samples to stdout, and the counters at the end and after each SIGUSR1. Everything else goes to
+    /// stderr without `--json`. Ends when the bounds are reached, a signal stops it, or the reader has closed stdout.
     ///
     /// With `--publish`, samples are published instead of printed, without a copy for each subscriber. Only one
     /// listener may publish in a domain.
@@ -94,7 +93,7 @@ impl ListenArgs {
     /// - [`Kind::DomainHeld`] if another listener publishes in the domain,
     /// - [`Kind::Short`] if there is too little memory for that,
     /// - [`Kind::Failed`] if the port is not available,
-    /// - [`Kind::Timeout`], or [`Kind::Interrupted`] if `stop` is set before the bounds are reached.
+    /// - [`Kind::Timeout`], or [`Kind::Interrupted`] if a signal stops the run before the bounds are reached.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (tell, stop) = (context.signals.report()?, context.signals.stop()?);
         let publish = self.publish.then(|| context.domain.of_publisher()).transpose()?;

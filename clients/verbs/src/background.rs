@@ -67,8 +67,8 @@ pub enum ModelOrder {
 }
 
 impl BackgroundArgs {
-    /// Sends the request to the hub and writes a line to `out`. Reads the model to load before it installs handlers for
-    /// signals, because a flag would not end the read of a terminal.
+    /// Sends the request to the hub and writes a line to stdout. Reads the model to load before it installs handlers
+    /// for signals, because a flag would not end the read of a terminal.
     ///
     /// # Errors
     ///

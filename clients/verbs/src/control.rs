@@ -30,7 +30,7 @@ fn verbs() -> impl TypedValueParser<Value = Verb> {
 }
 
 impl ControlArgs {
-    /// Sends the request to the hub in one of `places`, waits until the link has accepted it, and writes a line to `out`.
+    /// Sends the request to the hub, waits until the link has accepted it, and writes a line to stdout.
     ///
     /// # Errors
     ///

@@ -1,10 +1,12 @@
-//! Durations as people write them: `10s`, `250ms`, `5m`. One unit, no sums.
+//! Durations on the command line: a number with one unit, such as `10s`, `250ms` or `5m`.
 
 use std::time::Duration;
 
-/// The duration that `text` says: a number, possibly with a fraction, and `us`, `ms`, `s`, `m` or `h`.
+/// Parses a duration: a number, which may have a fraction, and `us`, `ms`, `s`, `m` or `h`.
 ///
-/// The error says what would be right.
+/// # Errors
+///
+/// Returns a message for the user if `text` is not a duration, or longer than a year.
 pub fn parse(text: &str) -> Result<Duration, String> {
     let wrong = || format!("{text:?} is no duration: write it like 10s, 250ms or 5m");
     let unit = text.find(|c: char| c.is_ascii_alphabetic()).ok_or_else(wrong)?;
@@ -25,7 +27,7 @@ pub fn parse(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Longer than anybody waits, and short enough to be added to any time.
+/// Longest duration, a year. It can be added to any time without an overflow.
 const LONGEST: Duration = Duration::from_secs(365 * 24 * 3600);
 
 #[cfg(test)]
@@ -33,7 +35,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn units() {
+    fn parses_one_number_with_one_unit() {
         assert_eq!(parse("10s"), Ok(Duration::from_secs(10)));
         assert_eq!(parse("250ms"), Ok(Duration::from_millis(250)));
         assert_eq!(parse("5m"), Ok(Duration::from_secs(300)));

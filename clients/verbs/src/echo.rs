@@ -44,15 +44,15 @@ Examples:
   scanhub echo front/scan --csv > scans.csv";
 
 impl EchoArgs {
-    /// Writes the samples of topics to `out` as they arrive. Notices go to `notes` (stderr) if `out` is not JSON. Ends at the
-    /// limits, when `stop` is set, or when the reader of `out` has closed it.
+    /// Writes the samples of topics to stdout as they arrive. Notices go to stderr without `--json`. Ends at the
+    /// limits, by a signal, or when the reader has closed stdout.
     ///
     /// # Errors
     ///
     /// - [`Kind::Usage`] if there is no such topic or the format does not go with the topics.
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let Selection { named, of_all } = Selection::parse(&self.topics)?;

@@ -43,8 +43,8 @@ fn parse_window(text: &str) -> Result<Duration, String> {
 const MIN_WINDOW: Duration = Duration::from_millis(500);
 
 impl HzArgs {
-    /// Writes a line per topic and second to `out`, and summaries at the end. Notices go to `notes` (stderr) if `out` is not
-    /// JSON. Ends as [`EchoArgs::run`](crate::echo::EchoArgs::run) does.
+    /// Writes a line per topic and second to stdout, and summaries at the end. Notices go to stderr without `--json`.
+    /// Ends as [`EchoArgs::run`](crate::echo::EchoArgs::run) does.
     ///
     /// # Errors
     ///

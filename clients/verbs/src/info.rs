@@ -23,14 +23,14 @@ pub struct InfoArgs {
 }
 
 impl InfoArgs {
-    /// Writes state, properties, counters and last error of the sensors to `out`.
+    /// Writes state, properties, counters and last error of the sensors to stdout.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoHub`] within a second if no hub runs.
     /// - [`Kind::NoTopic`] if the sensor does not exist; the message lists the sensors.
     /// - [`Kind::Timeout`] if a sensor's status does not arrive.
-    /// - [`Kind::Interrupted`] if `stop` is set.
+    /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         self.sensor.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;

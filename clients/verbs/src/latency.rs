@@ -70,8 +70,8 @@ To check a hundred scans: scanhub latency front/scan -n 100 --timeout 5s --max-p
 const LINE_INTERVAL: Duration = Duration::from_secs(1);
 
 impl LatencyArgs {
-    /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end. Each line covers the
-    /// run so far. Without `--json`, conditions and notices go to stderr. The result has bars on a terminal.
+    /// Writes the conditions, a line for each topic once a second, and the result of each topic at the end. Each line
+    /// covers the run so far. Without `--json`, conditions and notices go to stderr. The result has bars on a terminal.
     ///
     /// # Errors
     ///
@@ -349,7 +349,8 @@ fn time(ns: u64) -> String {
     }
 }
 
-/// Conditions of a measurement: priority and memory of the process, and resolution of the clock. Line of class `conditions`.
+/// Conditions of a measurement: priority and memory of the process, and resolution of the clock. Line of class
+/// `conditions`.
 #[derive(Clone, Debug, Serialize)]
 #[serde(tag = "class", rename = "conditions")]
 struct Conditions {
@@ -365,8 +366,8 @@ struct Conditions {
 }
 
 impl Conditions {
-    /// Takes real-time priority for the calling thread and locks the memory of its process if `is_realtime` and as far as
-    /// permitted, so that other programs do not add to the latency. Both stay.
+    /// Takes real-time priority for the calling thread and locks the memory of its process if `is_realtime` and as far
+    /// as permitted, so that other programs do not add to the latency. Both stay.
     fn take(wait: Wait, is_realtime: bool) -> Conditions {
         let processors = thread::available_parallelism().map_or(1, usize::from);
         let normal = Conditions {

@@ -54,9 +54,9 @@ Examples:
 green: clear, yellow: slow, red: stop or unknown, mark: at least one reflector mark";
 
 impl LedsArgs {
-    /// Shows the lights on `out` and on the LEDs until the limits are reached or `stop` is set. Notices go to `notes` (stderr)
-    /// without `json`. However the run ends, the red light is on then. An LED that fails during the run is reported and
-    /// tried again, while the others continue.
+    /// Shows the lights on stdout and on the LEDs until the limits are reached or a signal stops it. Notices go to
+    /// stderr without `--json`. The red light is on after every end of the run. An LED that fails during the run is
+    /// reported and tried again, while the others continue.
     ///
     /// # Errors
     ///

@@ -25,17 +25,17 @@ pub struct ListArgs {
 }
 
 impl ListArgs {
-    /// Writes the topics of every sensor of the hub to `out`, with rate, subscribers, payload type and revision. As text, the
-    /// problem of each sensor that has one follows.
+    /// Writes the topics of every sensor of the hub to stdout, with rate, subscribers, payload type and revision. As
+    /// text, the problem of each sensor that has one follows.
     ///
-    /// With `--domains`, writes every live domain instead, those below the root that the user named or all. Hubs that this user cannot reach follow,
-    /// with a command that does.
+    /// With `--domains`, writes every live domain instead: those below `--root`, or all. Hubs that this user cannot
+    /// reach follow, with a command that reaches them.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoHub`](scanhub_schema::Kind) within a second if no hub runs.
     /// - [`Kind::Interrupted`](scanhub_schema::Kind) if a signal requests the end.
-    /// - The errors of [`Domain::candidates`], and that of a write to `out`.
+    /// - The errors of [`Domain::candidates`], and that of a write to stdout.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (json, out) = (context.json, &mut context.out);
         match (self.domains, &context.domain.root) {

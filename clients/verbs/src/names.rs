@@ -14,9 +14,12 @@ pub struct TopicName {
 }
 
 impl TopicName {
-    /// The topic that `text` names, as in `front/scan`; `robot/zones` is the fold over all sensors.
+    /// Parses the name of a topic, such as `front/scan`. `robot/zones` is the combined verdict of all sensors.
     ///
-    /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
+    /// # Errors
+    ///
+    /// [`Kind::Usage`], with the names of all topics, if the topic does not exist, and if the sensor's name is not
+    /// valid.
     pub fn parse(text: &str) -> Result<TopicName, Failure> {
         let unknown = |how: String| {
             Failure::new(Kind::Usage, format!("no topic {text:?}"), format!("{how}{}", topics()))
@@ -36,7 +39,7 @@ impl TopicName {
         Ok(name)
     }
 
-    /// Not one sensor's topic but the fold over all of them.
+    /// Returns whether the topic is the combined verdict of all sensors.
     pub fn is_robot(&self) -> bool {
         self.sensor == ROBOT && self.topic == Topic::Zones
     }
@@ -48,39 +51,39 @@ impl fmt::Display for TopicName {
     }
 }
 
-/// The position of what publishes as `name` beside a hub: numbers from 128 on are of no link.
+/// Returns the index of a program that publishes as `name` next to a hub. Links of a hub have indexes below 128.
 pub fn position(name: &str) -> u8 {
     const FIRST: u8 = 128;
     let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
     FIRST + (sum % u32::from(u8::MAX - FIRST)) as u8
 }
 
-/// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
+/// Returns the result of a check of a name on the command line. Its error is [`Kind::Usage`].
 pub fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
 }
 
-/// All topics of a sensor.
+/// Returns a hint with the names of all topics.
 fn topics() -> String {
     format!("topics are {}", Topic::ALL.map(Topic::name).join(", "))
 }
 
-/// The topic that `word` may have been meant for, if one is near.
+/// Returns a hint with the topic that `word` may be a misspelling of. Empty if there is none.
 fn nearest(sensor: &str, word: &str) -> String {
     let topic = near(word, Topic::ALL.into_iter().map(Topic::name));
     topic.map_or(String::new(), |topic| format!("did you mean {sensor}/{topic}? "))
 }
 
-/// That of `known` which `word` is nearest to, if it is near.
+/// Returns the most similar name in `known`, if `word` may be a misspelling of it.
 fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let near = |known: &str| strsim::jaro_winkler(known, word);
     known.max_by(|a, b| near(a).total_cmp(&near(b))).filter(|known| near(known) > NEAR)
 }
 
-/// From this similarity on, a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
+/// Similarity above which a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
 const NEAR: f64 = 0.8;
 
-/// The sensor of `name` has other topics than that, and never will have it.
+/// Returns the failure that the sensor of `name` has only other `topics`, now and later.
 pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
@@ -90,7 +93,7 @@ pub fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     Failure::new(Kind::NoTopic, format!("there is no topic {name}{who}"), hint)
 }
 
-/// The hub has no `sensor`, but `sensors`.
+/// Returns the failure that the hub has no `sensor`, with its `sensors`.
 pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
         [] => "it has no sensors: `scanhub run --link NAME=PORT`".to_owned(),
@@ -103,19 +106,21 @@ pub fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     Failure::new(Kind::NoTopic, format!("the hub has no sensor {sensor}"), hint)
 }
 
-/// Sensor and topic that one word selects.
+/// Selection of topics by one word of the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Word {
-    /// The sensor; nothing: all of them.
+    /// The sensor; `None` for all sensors.
     pub sensor: Option<String>,
-    /// The topic; nothing: all of them.
+    /// The topic; `None` for all topics.
     pub topic: Option<Topic>,
 }
 
 impl Word {
-    /// What `text` stands for; `robot/zones` is the fold over all sensors.
+    /// Parses `SENSOR/TOPIC`, `*/TOPIC`, `SENSOR/*` or `*/*`. `robot/zones` is the combined verdict of all sensors.
     ///
-    /// [`Kind::Usage`] with the topics that there are, or if the sensor's name is not possible.
+    /// # Errors
+    ///
+    /// As for [`TopicName::parse`].
     pub fn parse(text: &str) -> Result<Word, Failure> {
         let (sensor, topic) = text.split_once('/').unwrap_or((text, ""));
         match (sensor, topic) {
@@ -145,23 +150,28 @@ impl Word {
     }
 }
 
-/// The topics that several words select together.
+/// Selection of topics by several words of the command line.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Selection {
-    /// Topics of sensors that are named, each once, in the order of the words.
+    /// Topics of named sensors, each once, in the order of the words.
     pub(crate) named: Vec<TopicName>,
-    /// Topics of all sensors, each once, in their own order.
+    /// Topics of all sensors, each once, in the order of [`Topic::ALL`].
     pub(crate) of_all: Vec<Topic>,
 }
 
 impl Selection {
-    /// What `texts` stand for; nothing said is nothing selected. Failures as of [`Word::parse`].
+    /// Parses the words `texts`. Without words, the selection is empty.
+    ///
+    /// # Errors
+    ///
+    /// As for [`TopicName::parse`].
     pub(crate) fn parse(texts: &[String]) -> Result<Selection, Failure> {
         let mut named: Vec<TopicName> = Vec::new();
         let mut of_all = Vec::new();
         for text in texts {
             let word = Word::parse(text)?;
-            // Who made a name's topics is known when they are there: one that is named has what a link has.
+            // The maker of a named sensor is unknown until its topics exist, so `SENSOR/*` selects the topics of a
+            // link.
             let may_have = |topic: Topic| word.sensor.is_none() || topic.maker() == Maker::Link;
             let is_meant = |topic: &Topic| word.topic.map_or(may_have(*topic), |known| known == *topic);
             let meant = Topic::ALL.into_iter().filter(is_meant);
@@ -181,7 +191,7 @@ impl Selection {
     }
 }
 
-/// Stands for all sensors, or all topics.
+/// Word for all sensors, or all topics.
 const ALL: &str = "*";
 
 #[cfg(test)]
@@ -189,7 +199,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names() {
+    fn parses_names_and_suggests_similar_ones() {
         let name = TopicName::parse("front/scan").unwrap();
         assert_eq!(
             (name.sensor.as_str(), name.topic, name.to_string()),
@@ -226,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_may_stand_for_all() {
+    fn selects_all_sensors_or_topics() {
         assert_eq!(selection(&["*/scan"]), (vec![], vec![Topic::Scan]));
         let front: Vec<_> = Topic::OF_LINKS.iter().map(|topic| format!("front/{}", topic.name())).collect();
         assert_eq!(selection(&["front/*"]), (front, vec![]));
@@ -240,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_topic_is_refused_with_what_there_is() {
+    fn refuses_unknown_topics_with_suggestions() {
         let refused = |text: &str| Word::parse(text).unwrap_err();
         for bad in [
             "*",

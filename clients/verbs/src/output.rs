@@ -1,5 +1,5 @@
-//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb whose reader
-//! closes the output ends without an error.
+//! Lines on stdout and stderr. Each line is written with one call, so a killed verb leaves no partial line. A verb
+//! whose reader closes the output ends without an error.
 
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
@@ -71,8 +71,8 @@ impl<'a> Output<'a> {
         self.end()
     }
 
-    /// Writes the line of text that `build` makes without a line feed. Control characters, which move a terminal's cursor or
-    /// change its colors, become `?`: ports, types and errors may come from another machine.
+    /// Writes the line of text that `build` makes without a line feed. Control characters, which move a terminal's
+    /// cursor or change its colors, become `?`: ports, types and errors may come from another machine.
     ///
     /// # Errors
     ///
@@ -101,7 +101,8 @@ impl<'a> Output<'a> {
     }
 }
 
-/// Replaces each byte of a control character in UTF-8 `text` by `?`: C0, DEL and C1 (ECMA-48). A line feed becomes a space.
+/// Replaces each byte of a control character in UTF-8 `text` by `?`: C0, DEL and C1 (ECMA-48). A line feed becomes a
+/// space.
 fn disarm(text: &mut [u8]) {
     let mut before = 0;
     for at in 0..text.len() {
@@ -159,8 +160,8 @@ pub fn columns(out: impl AsFd) -> Option<usize> {
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are left out, the lowest rank
-/// first, because a cut number would read as another number. The last part stays, however long it is.
+/// Joins `parts` with two spaces in at most `columns` columns. If they do not fit, whole parts are left out, the lowest
+/// rank first, because a cut number would read as another number. The last part stays, however long it is.
 #[cfg(feature = "record")]
 pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     let length =
@@ -173,8 +174,8 @@ pub fn fitting(mut parts: Vec<(u8, String)>, columns: usize) -> String {
     parts.join("  ")
 }
 
-/// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. It writes each
-/// piece at once or not at all.
+/// Writer that drops a line instead of waiting for a slow reader, so that the output does not delay the samples. It
+/// writes each piece at once or not at all.
 pub struct LossyWriter<'a, W> {
     to: &'a mut W,
     /// Whether the verb ends. Then no samples can be delayed, and the writer waits for the reader up to `patience`.
@@ -192,8 +193,8 @@ impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
         LossyWriter { to, stop, patience: PATIENCE }
     }
 
-    /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free, which is
-    /// more than a line has (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
+    /// Returns whether a piece can be written without waiting. The system reports a pipe as writable if a page is free,
+    /// which is more than a line has (pipe(7), PIPE_BUF). The result is also true if the write will return an error.
     fn has_room(&mut self) -> bool {
         let patience = if self.stop.load(Ordering::Relaxed) { self.patience } else { Duration::ZERO };
         let began = Instant::now();

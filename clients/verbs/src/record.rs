@@ -113,9 +113,10 @@ impl RecordArgs {
         self.output.as_deref() == Some(Path::new("-"))
     }
 
-    /// Records until the bounds are reached or a signal arrives, and then finishes the file. Another signal meanwhile ends the run
-    /// at once. Progress goes to stdout, or to stderr if stdout carries the recording. Notices go to stderr without `--json`.
-    /// Lines that their reader does not take are dropped, so that they do not delay the recording.
+    /// Records until the bounds are reached or a signal arrives, and then finishes the file. Another signal meanwhile
+    /// ends the run at once. Progress goes to stdout, or to stderr if stdout carries the recording. Notices go to
+    /// stderr without `--json`. Lines that their reader does not take are dropped, so that they do not delay the
+    /// recording.
     ///
     /// # Errors
     ///
@@ -159,7 +160,8 @@ impl RecordArgs {
         quiet(end).and(quiet(finished))
     }
 
-    /// Creates the first file, or takes stdout in its place. Returns the disk thread that writes the samples of `queue` to it.
+    /// Creates the first file, or takes stdout in its place. Returns the disk thread that writes the samples of `queue`
+    /// to it.
     fn create_file(&self, places: &[Domain], queue: &Arc<Queue>) -> Result<Disk, Failure> {
         let wall_ns = clock::wall_ns();
         let default = files::default_name(wall_ns);

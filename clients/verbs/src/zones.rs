@@ -48,16 +48,16 @@ enum Order {
 }
 
 impl ZonesArgs {
-    /// Follows the sensor for a while, then writes its mask to `out` as TOML for the hub, and doubts about it to `notes`
-    /// (stderr). A terminal there shows the progress.
+    /// Observes the sensor for a while, then writes its mask to stdout as TOML for the hub, and warnings about it to
+    /// stderr. A terminal there shows the progress.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Configuration`] if a value is not possible.
+    /// - [`Kind::Configuration`] if a value is not valid.
     /// - [`Kind::NoHub`] and [`Kind::NoTopic`] as [`EchoArgs::run`](crate::echo::EchoArgs::run).
     /// - [`Kind::Timeout`] if too few scans arrived.
     /// - [`Kind::Failed`] if the hub went away, or the sensor's settings changed meanwhile.
-    /// - [`Kind::Interrupted`] if `stop` is set.
+    /// - [`Kind::Interrupted`] if a signal stops the run.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (places, stop) = (context.domain.places()?, context.signals.stop()?);
         let (sensor, Order::Mask { run_for, within }) = (&self.sensor, &self.order);
@@ -184,7 +184,7 @@ impl Look<'_> {
                 let slice = self.slice();
                 if let (Some(pose), Some(within_mm)) = (self.pose, self.within_mm) {
                     let body = self.body.get_or_insert_with(|| Body::new(pose, within_mm));
-                    if !body.look(slice, scan) {
+                    if !body.add(slice, scan) {
                         let message = format!("{} was set to another resolution or unit", name.sensor);
                         return Err(Failure::new(Kind::Failed, message, "look again").into());
                     }

@@ -53,12 +53,12 @@ const BYTES_PER_SECOND: f64 = 80_000.0;
 const MESSAGE_TIME: Duration = Duration::from_secs(4);
 
 impl WatchArgs {
-    /// Shows the picture of the first live domain on the terminal, until the user
-    /// quits, the limits are reached or `stop` is set.
+    /// Shows the picture of the sensors on the terminal, until the user quits, the limits are reached or a signal stops
+    /// it.
     ///
     /// # Errors
     ///
-    /// - [`Kind::Usage`] with `json`, without a terminal, or if a sensor's name is not valid.
+    /// - [`Kind::Usage`] with `--json`, without a terminal, or if a sensor's name is not valid.
     /// - [`Kind::Failed`] if the terminal cannot be used.
     /// - [`Kind::Interrupted`] if Ctrl-C ends a bounded run.
     /// - [`Kind::NoHub`], [`Kind::NoTopic`] and [`Kind::Timeout`] as for `echo`.

@@ -52,7 +52,7 @@ struct Plan<'a> {
 }
 
 impl SiteArgs {
-    /// Checks a site file, and writes its contents to `out`.
+    /// Checks a site file, and prints its contents.
     ///
     /// # Errors
     ///

@@ -105,15 +105,15 @@ fn cuboid(text: &str) -> Result<[[f64; 2]; 3], String> {
 }
 
 impl TiltArgs {
-    /// Subscribes to the scans of the sensor and the angles of its mount in the first live domain of `places`. Writes the
-    /// obstacles of each sweep to `out`. Without `json`, reports about the angles and notices go to `notes` (stderr). Ends at
-    /// the limits, when `stop` is set, or when the reader of `out` has closed it.
+    /// Subscribes to the scans of the sensor and the angles of its mount. Writes the obstacles of each sweep to stdout.
+    /// Without `--json`, reports about the angles and notices go to stderr. Ends at the limits, by a signal, or when
+    /// the reader has closed stdout.
     ///
     /// # Errors
     ///
     /// - [`Kind::NoTopic`] if the sensor or the mount does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run or a check ended.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run or a check before its end.
     /// - [`Kind::Check`] if a check has failed.
     /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {

@@ -51,9 +51,9 @@ Examples:
   scanhub track --site house.toml --count left";
 
 impl TrackArgs {
-    /// Subscribes to the scans and foregrounds of the site's sensors in the first live domain of `places`. Writes tracks and
-    /// events to `out`, or only the counts of some doors. Without `json`, notices go to `notes` (stderr). Ends at the limits,
-    /// when `stop` is set, or when the reader of `out` has closed it.
+    /// Subscribes to the scans and foregrounds of the site's sensors. Writes tracks and events to stdout, or only the
+    /// counts of some doors. Without `--json`, notices go to stderr. Ends at the limits, by a signal, or when the
+    /// reader has closed stdout.
     ///
     /// # Errors
     ///
@@ -61,7 +61,7 @@ impl TrackArgs {
     /// - [`Kind::Configuration`] if the site has no such door.
     /// - [`Kind::NoTopic`] if a sensor does not exist; the message lists the sensors.
     /// - [`Kind::NoHub`] if the run is bounded and no hub runs at its start.
-    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if `stop` was set before a bounded run ended.
+    /// - [`Kind::Timeout`], and [`Kind::Interrupted`] if a signal stopped a bounded run before its end.
     /// - The errors of [`PublishSession::beside`](scanhub_client::PublishSession::beside) if it publishes.
     pub fn run(&self, context: &mut Context) -> Result<(), Failure> {
         let (places, stop) = (context.domain.places()?, context.signals.stop()?);

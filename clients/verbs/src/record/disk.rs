@@ -47,7 +47,7 @@ struct Trouble {
 
 /// Place of a recording.
 pub(super) enum Destination {
-    /// Files, of which the next one is started if the current one is full or fails.
+    /// Files. The next one is started if the current one is full or fails.
     Files(Files),
     /// A stream, such as stdout.
     Stream(File),

@@ -60,7 +60,8 @@ pub(super) struct Report<'a> {
 const EVERY: Duration = Duration::from_secs(1);
 
 impl<'a> Report<'a> {
-    /// Creates the reports of a run. They go to `out`, which may be `terminal`, and notices to `notes` if `out` is not JSON.
+    /// Creates the reports of a run. They go to `out`, which may be `terminal`, and notices to `notes` if `out` is not
+    /// JSON.
     pub(super) fn new(
         look: Look,
         out: &'a mut dyn Write,

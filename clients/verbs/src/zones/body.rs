@@ -1,48 +1,49 @@
-//! Decides which readings of a sensor are the robot's own body: what stays within a circle around the robot's centre
-//! during the whole observation. Scans in, sectors out; refuses to know where scans come from and how sectors are
-//! written.
+//! Computes which readings of a sensor are the robot's own body, as sectors with a range. The body is whatever stays
+//! within a circle around the robot's center during the whole observation.
 //!
-//! The observation is divided into slices of time. What is seen in all slices at about the same range is body; what is
-//! seen in only some of them came and went, and is left out.
+//! The observation is divided into slices of time. An object that a beam meets in all slices at about the same range is
+//! body. An object that it meets in only some slices is not.
 
 use scanhub_schema::{Pose, Scan, in_degrees, in_sector_mdeg};
 
-/// Slices of the time.
+/// Number of time slices.
 pub(crate) const SLICES: usize = 10;
-/// The most sectors that a hub takes.
+/// Maximum number of sectors that a hub accepts.
 const SECTORS: usize = 64;
-/// The greatest range of a sector that a hub takes.
+/// Maximum range of a sector that a hub accepts.
 const FARTHEST_MM: u32 = 65_000;
-/// So much farther than it was met a reading still counts as the body: five standard deviations of 7 mm, which is the most
-/// that recordings of standing sensors show, and the 15 mm by which two devices differ.
+/// Margin behind the farthest reading of the body, in which readings still count as body. It is five standard
+/// deviations of 7 mm, the maximum in recordings of standing sensors, and the 15 mm by which two devices differ.
 const MARGIN_MM: u32 = 50;
-/// The same where the body hides all that is behind it, so that nothing is missed by looking less far: four standard
-/// deviations of the 60 mm by which a reading in a hundred is off, which would be a stop every few seconds.
+/// Margin for a beam that the body hides completely, so that a large margin hides nothing else. One reading in a
+/// hundred is off by 60 mm, which would cause a stop every few seconds. The margin is four standard deviations of that.
 const BEHIND_MM: u32 = 250;
-/// A beam of whose readings so large a share are of the body sees nothing behind it.
+/// Share of body readings from which on the body hides the beam completely.
 const FULL: f64 = 0.9;
 
-/// A share of a slice's scans that a beam has to meet something in, so that one wrong reading is nothing.
+/// Share of a slice's scans in which a beam must meet an object, so that a single wrong reading has no effect.
 const SHARE: f64 = 0.05;
-/// A fifth of the slices may differ from the others: somebody may pass before or behind the body.
+/// Divisor of the number of slices that may differ from the others, because a person may pass near the body.
 const PASSING: usize = 5;
-/// How much the nearest readings of a body differ from slice to slice: noise and a robot that trembles. What is alive
-/// moves more.
+/// Maximum difference between the nearest readings of a body in different slices, from noise and a trembling robot. A
+/// person moves more.
 const STEADY_MM: u32 = 100;
-/// So near to an edge, in degrees, a beam may tell something between the body and what is behind: half a spot of
-/// 12 mm at 0.4 m.
+/// Distance from an edge of the body, in degrees, in which a beam may measure any range between the body and the object
+/// behind it: half a spot of 12 mm at 0.4 m.
 const EDGE_DEG: f64 = 1.0;
-/// Neighbouring beams whose ranges differ by less make one sector: what it hides more than needed is no wider than that.
+/// Maximum difference between the ranges of neighboring beams in a sector. A sector hides at most this much more than
+/// needed.
 const ALIKE_MM: u32 = 50;
-/// Beams between two that moved, and belong together all the same.
+/// Maximum number of beams without motion between two beams with motion in the same sector.
 const GAP_BEAMS: usize = 3;
 
-/// What was seen so far.
+/// Observation of a sensor.
 pub(crate) struct Body {
     pose: Pose,
     within_mm: f64,
-    /// Of the first scan; all others are to be alike.
+    /// Shape of the first scan, which all other scans must have.
     shape: Option<Shape>,
+    /// Number of scans in each slice.
     scans: [u32; SLICES],
     beams: Vec<Beam>,
 }
@@ -51,56 +52,57 @@ pub(crate) struct Body {
 type Shape = (u16, f64, f64, u32);
 
 struct Beam {
-    /// In the robot's frame.
+    /// Unit vector in the robot's frame.
     direction: (f64, f64),
     angle_mdeg: i32,
-    /// Where it leaves the circle, and the margin; 0 if it never is inside.
+    /// Range at which the beam leaves the circle, plus the margin. 0 if it is never inside.
     circle_mm: u32,
-    /// Scans in which it met anything at all.
+    /// Number of scans with a reading.
     valid: u32,
     slices: [Slice; SLICES],
 }
 
-/// What a beam met within the circle.
+/// Readings of a beam within the circle in one slice.
 #[derive(Clone, Copy, Default)]
 struct Slice {
-    met: u32,
+    count: u32,
     nearest_mm: u32,
     farthest_mm: u32,
 }
 
-/// The body, and what was no body.
+/// Result of an observation: the body, and other objects in the circle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Mask {
-    /// Readings nearer than `range_mm` are the body; in order, at most [`SECTORS`].
+    /// Sectors in which readings nearer than `range_mm` are the body, in the order of the beams. At most [`SECTORS`].
     pub(crate) sectors: Vec<Sector>,
-    /// What moved, or came, or went: at `range_mm` where it was nearest.
+    /// Sectors of objects that moved, appeared or disappeared, with their shortest range.
     pub(crate) moving: Vec<Sector>,
-    /// Beams of the scan.
+    /// Number of beams of a scan.
     pub(crate) of_beams: usize,
 }
 
-/// Neighbouring beams.
+/// Neighboring beams.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Sector {
     /// Angle of the first beam in 1/1000 degree.
     pub(crate) from_mdeg: i32,
-    /// Angle of the last one.
+    /// Angle of the last beam in 1/1000 degree.
     pub(crate) to_mdeg: i32,
-    /// How many there are.
+    /// Number of beams.
     pub(crate) beams: usize,
-    /// In mm.
+    /// Range in mm.
     pub(crate) range_mm: u32,
 }
 
 impl Body {
-    /// Nothing seen yet by a sensor at `pose`; what is nearer than `within_mm` to the robot's centre may be body.
+    /// Creates the observation of a sensor at `pose`. Objects nearer than `within_mm` to the robot's center may be
+    /// body.
     pub(crate) fn new(pose: Pose, within_mm: f64) -> Body {
         Body { pose, within_mm, shape: None, scans: [0; SLICES], beams: Vec::new() }
     }
 
-    /// Looks at `scan`, which was made in slice `slice`; false if it is shaped otherwise than those before.
-    pub(crate) fn look(&mut self, slice: usize, scan: &Scan) -> bool {
+    /// Adds `scan`, which was made in slice `slice`. Returns false if its shape differs from that of earlier scans.
+    pub(crate) fn add(&mut self, slice: usize, scan: &Scan) -> bool {
         let shape = (scan.count, scan.first_angle, scan.step, scan.unit_um);
         if *self.shape.get_or_insert(shape) != shape {
             return false;
@@ -119,25 +121,25 @@ impl Body {
             let range = f64::from(range_mm);
             if (x_mm + range * x).hypot(y_mm + range * y) < self.within_mm {
                 let met = &mut beam.slices[slice];
-                met.nearest_mm = if met.met == 0 { range_mm } else { met.nearest_mm.min(range_mm) };
+                met.nearest_mm = if met.count == 0 { range_mm } else { met.nearest_mm.min(range_mm) };
                 met.farthest_mm = met.farthest_mm.max(range_mm);
-                met.met += 1;
+                met.count += 1;
             }
         }
         true
     }
 
-    /// Scans looked at.
+    /// Returns the number of scans.
     pub(crate) fn scans(&self) -> u32 {
         self.scans.iter().sum()
     }
 
-    /// Slices of which there was a scan.
+    /// Returns the number of slices with a scan.
     pub(crate) fn seen_slices(&self) -> usize {
         self.scans.iter().filter(|&&scans| scans > 0).count()
     }
 
-    /// What is to be concluded from all that was seen.
+    /// Computes the mask from all scans.
     pub(crate) fn mask(&self) -> Mask {
         let met: Vec<Met> = self.beams.iter().map(|beam| Met::of(beam, &self.scans)).collect();
         let slices = self.seen_slices();
@@ -158,7 +160,7 @@ impl Body {
         let direction = self.pose.direction(angle);
         let angle_mdeg = in_sector_mdeg(angle);
         let (x_mm, y_mm) = (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m);
-        // The greater root of |sensor + range * direction| = circle; none is not a number, and so becomes 0.
+        // The greater root of |sensor + range * direction| = circle. Without a root it is NaN, which becomes 0.
         let along = x_mm * direction.0 + y_mm * direction.1;
         let across = self.within_mm.powi(2) - (x_mm.powi(2) + y_mm.powi(2) - along.powi(2));
         let leaves = (across.sqrt() - along).ceil() as u32;
@@ -167,7 +169,7 @@ impl Body {
     }
 
     fn sectors(&self, runs: Vec<Run>, range_mm: impl Fn(&Run) -> u32) -> Vec<Sector> {
-        // The lesser angle first, whichever way the beams turn; what goes across 180 degrees is two sectors.
+        // The lower angle comes first in both directions of rotation. A run across 180 degrees becomes two sectors.
         let is_clockwise = self.shape.is_some_and(|(_, _, step, _)| step < 0.0);
         let mut sectors: Vec<Sector> = Vec::new();
         for run in &runs {
@@ -182,9 +184,9 @@ impl Body {
     }
 }
 
-/// What one beam met in the slices in which it met something often enough; both from the least on.
+/// Ranges of a beam in the slices in which it met an object often enough, in ascending order.
 struct Met {
-    /// It sees nothing behind what it met.
+    /// Whether the objects that it met hide everything behind them.
     is_full: bool,
     circle_mm: u32,
     nearest_mm: Vec<u32>,
@@ -198,7 +200,7 @@ impl Met {
             .slices
             .iter()
             .zip(scans)
-            .filter_map(|(slice, scans)| (slice.met >= enough(*scans)).then_some(slice))
+            .filter_map(|(slice, scans)| (slice.count >= enough(*scans)).then_some(slice))
             .collect();
         let sorted = |range_mm: fn(&Slice) -> u32| {
             let mut ranges: Vec<u32> = met.iter().map(|slice| range_mm(slice)).collect();
@@ -206,7 +208,7 @@ impl Met {
             ranges
         };
         Met {
-            is_full: f64::from(met.iter().map(|slice| slice.met).sum::<u32>())
+            is_full: f64::from(met.iter().map(|slice| slice.count).sum::<u32>())
                 >= FULL * f64::from(beam.valid),
             circle_mm: beam.circle_mm,
             nearest_mm: sorted(|slice| slice.nearest_mm),
@@ -218,7 +220,7 @@ impl Met {
         self.nearest_mm.len()
     }
 
-    /// Something is met in all of `slices`, and stays where it is.
+    /// Returns whether the beam met an object in all of `slices`, at about the same range.
     fn is_body(&self, slices: usize) -> bool {
         if self.slices() < slices {
             return false;
@@ -228,36 +230,38 @@ impl Met {
         near.zip(far).is_some_and(|(near, far)| far.saturating_sub(*near) <= STEADY_MM)
     }
 
-    /// Readings nearer than this are the body that is met, but for what passes behind its edge.
+    /// Returns the range below which readings are the body.
     fn reach_mm(&self, slices: usize) -> u32 {
         let reach = self.farthest_mm.iter().nth_back(slices / PASSING).copied().unwrap_or_default();
         reach + if self.is_full { BEHIND_MM } else { MARGIN_MM }
     }
 
-    /// The nearest that was met at `range_mm` or farther; 0 if nothing was.
+    /// Returns the nearest reading at `range_mm` or farther. 0 if there is none.
     fn beyond(&self, range_mm: u32) -> u32 {
         self.nearest_mm.iter().copied().find(|&nearest| nearest >= range_mm).unwrap_or_default()
     }
 }
 
-/// Readings of `beam` nearer than this are the body; 0 if none are. At an edge of the body, `edge` beams to either side, all
-/// that is within the circle may be: spots are wider than beams, robots tremble, and what is told lies anywhere between
-/// the body and what is behind. What is lost by that is a strip that no leg fits into.
+/// Returns the range below which readings of `beam` are the body. 0 if none are.
+///
+/// Within `edge` beams of an edge of the body, every reading in the circle may be body. Spots are wider than beams,
+/// robots tremble, and a range there may lie anywhere between the body and a farther object. The strip that this hides
+/// is too narrow for a leg.
 fn range_mm(met: &[Met], is_body: &[bool], beam: usize, edge: usize, slices: usize) -> u32 {
     let near = |distance: usize| {
         let (first, last) = (beam.saturating_sub(distance), beam.saturating_add(distance).min(met.len() - 1));
         &is_body[first..=last]
     };
     match &met[beam] {
-        edge_of_it if is_body[beam] && near(edge).contains(&false) => edge_of_it.circle_mm,
-        within if is_body[beam] => within.reach_mm(slices),
-        beside if near(1).contains(&true) => beside.circle_mm,
-        beside if near(edge).contains(&true) && beside.slices() > slices / PASSING => beside.circle_mm,
+        at_edge if is_body[beam] && near(edge).contains(&false) => at_edge.circle_mm,
+        inside if is_body[beam] => inside.reach_mm(slices),
+        outside if near(1).contains(&true) => outside.circle_mm,
+        outside if near(edge).contains(&true) && outside.slices() > slices / PASSING => outside.circle_mm,
         _ => 0,
     }
 }
 
-/// Neighbouring beams, and between which values theirs are.
+/// Neighboring beams, with the lowest and the highest of their values.
 #[derive(Clone, Copy)]
 struct Run {
     first: usize,
@@ -271,6 +275,7 @@ impl Run {
         self.last - self.first + 1
     }
 
+    /// Returns the run from the first to the last beam of both.
     fn and(self, other: Run) -> Run {
         Run {
             first: self.first.min(other.first),
@@ -280,14 +285,14 @@ impl Run {
         }
     }
 
-    /// What it hides.
+    /// Returns the area that it hides, in beams times mm.
     fn area(&self) -> u64 {
         self.beams() as u64 * u64::from(self.most_mm)
     }
 }
 
-/// Beams whose value is not 0 as runs, in which at most `gap` beams without one lie between two, and no two values
-/// differ by more than `alike_mm`.
+/// Groups beams whose value is not 0 into runs. A run has at most `gap` beams without a value between two others, and
+/// its values differ by at most `alike_mm`.
 fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
     let mut runs: Vec<Run> = Vec::new();
     for (beam, &value) in values_mm.iter().enumerate().filter(|(_, value)| **value > 0) {
@@ -304,7 +309,7 @@ fn runs(values_mm: &[u32], gap: usize, alike_mm: u32) -> Vec<Run> {
     runs
 }
 
-/// Joins neighbours until a hub takes them, first those that hide the least more by it.
+/// Joins neighboring runs until a hub accepts their number. It first joins those that add the smallest hidden area.
 fn join(mut runs: Vec<Run>) -> Vec<Run> {
     while runs.len() > SECTORS {
         let more = |at: &usize| {
@@ -327,7 +332,7 @@ mod tests {
     const WALL_MM: u16 = 5000;
     const SCANS: usize = 40;
 
-    /// What a sensor at the robot's centre makes of scans whose beams are `range_mm(beam, slice, scan of the slice)`.
+    /// Returns the mask of a sensor at the robot's center. Its ranges are `range_mm(beam, slice, scan of the slice)`.
     fn mask(range_mm: impl Fn(usize, usize, usize) -> Option<u16>) -> Mask {
         learn(Pose::default(), 1000.0, range_mm)
     }
@@ -337,11 +342,11 @@ mod tests {
         let mut scan = Scan::of(ScanHead::lms(COUNT, angle_mdeg(0), 500, 1, 13), &[0; COUNT]);
         let code = scan.no_return;
         for slice in 0..SLICES {
-            for number in 0..SCANS {
+            for index in 0..SCANS {
                 for beam in 0..COUNT {
-                    scan.arrays().ranges[beam] = range_mm(beam, slice, number).unwrap_or(code);
+                    scan.arrays().ranges[beam] = range_mm(beam, slice, index).unwrap_or(code);
                 }
-                assert!(body.look(slice, &scan));
+                assert!(body.add(slice, &scan));
             }
         }
         assert_eq!((body.scans(), body.seen_slices()), ((SLICES * SCANS) as u32, SLICES));
@@ -352,44 +357,44 @@ mod tests {
         Sector { from_mdeg: angle_mdeg(first), to_mdeg: angle_mdeg(last), beams: last - first + 1, range_mm }
     }
 
-    /// Half degrees, of which beam 180 looks ahead.
+    /// Returns the angle of a beam: steps of half a degree, and beam 180 points ahead.
     fn angle_mdeg(beam: usize) -> i32 {
         beam as i32 * 500 - 90_000
     }
 
-    /// A body from beam `first` to `last`, as far as `range_mm`, in a circle of a metre: two beams of it and one beside it are
-    /// its edge.
+    /// Returns the sectors of a body from beam `first` to `last`, up to `range_mm`, in a circle of one meter. On each
+    /// side, two of its beams and the next one are its edge.
     fn hidden(first: usize, last: usize, range_mm: u32) -> Vec<Sector> {
         let edge = |from: usize| sector(from, from + 2, 1050);
         vec![edge(first - 1), sector(first + 2, last - 2, range_mm), edge(last - 1)]
     }
 
-    /// Noise of a few mm, the same in every run.
+    /// Returns noise of a few mm, the same in every run.
     fn noise(beam: usize, slice: usize, scan: usize) -> u16 {
         ((beam * 31 + slice * 17 + scan * 7) % 11) as u16
     }
 
     #[test]
-    fn a_post_is_body_with_a_beam_beside_it_on_either_side() {
+    fn post_is_body_with_one_more_beam_on_each_side() {
         let post = |beam, slice, scan| match beam {
             60..=67 => Some(400 + noise(beam, slice, scan)),
             _ => Some(WALL_MM),
         };
-        // As far as it was met, and a good deal of what it hides; the beams beside it as far as it matters.
+        // Behind the post, the mask has the large margin. The beams next to it are hidden up to the circle.
         assert_eq!(mask(post), Mask { sectors: hidden(60, 67, 660), moving: vec![], of_beams: COUNT });
     }
 
     #[test]
-    fn nothing_there_is_an_empty_list() {
+    fn mask_without_body_is_empty() {
         let nothing = Mask { of_beams: COUNT, ..Mask::default() };
         assert_eq!(mask(|_, _, _| Some(WALL_MM)), nothing);
         assert_eq!(mask(|_, _, _| None), nothing);
-        assert_eq!(Body::new(Pose::default(), 1000.0).mask(), Mask::default(), "not a scan");
+        assert_eq!(Body::new(Pose::default(), 1000.0).mask(), Mask::default(), "no scan");
     }
 
     #[test]
-    fn what_comes_and_goes_is_left_out_and_named() {
-        // Somebody walks past in six slices, ten beams further in each, while a post stands there.
+    fn moving_object_is_reported_and_is_not_body() {
+        // A person walks past a post in six slices, ten beams farther in each.
         let found = mask(|beam, slice, scan| match beam {
             60..=67 => Some(400 + noise(beam, slice, scan)),
             _ if (2..8).contains(&slice) && (100 + 10 * slice..115 + 10 * slice).contains(&beam) => Some(700),
@@ -399,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn who_walks_up_and_down_all_the_time_is_no_body() {
+    fn person_who_keeps_walking_is_not_body() {
         let found = mask(|beam, slice, _| match beam {
             100..=130 => Some(400 + 50 * slice as u16),
             _ => Some(WALL_MM),
@@ -408,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn who_passes_before_a_body_neither_widens_nor_hides_it() {
+    fn person_in_front_of_body_does_not_change_it() {
         let found = mask(|beam, slice, _| match beam {
             90..=150 if slice == 4 => Some(250),
             100..=110 => Some(500),
@@ -419,8 +424,9 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_that_is_met_by_turns_hides_what_lies_between() {
-        // Beams 68 and 70 meet body, wall and what lies between by turns; the second one is too far from the body for that.
+    fn edge_hides_ranges_between_body_and_wall() {
+        // Beams 68 and 70 measure ranges between the body and the wall. Beam 70 is too far from the body to be its
+        // edge.
         let found = mask(|beam, slice, scan| match beam {
             60..=67 => Some(400),
             68 | 70 if scan % 8 == 0 && slice < 6 => Some(450 + 50 * (scan as u16 / 4)),
@@ -431,8 +437,8 @@ mod tests {
     }
 
     #[test]
-    fn a_cable_is_body_although_it_is_met_seldom_and_never_at_one_range() {
-        // It is met in six of forty scans, and each time somewhere else.
+    fn cable_is_body_although_readings_are_rare_and_scattered() {
+        // Six of forty scans meet the cable, each at another range.
         let found = mask(|beam, slice, scan| match beam {
             200..=202 if scan % 7 == slice % 7 => Some(300 + ((slice * 97 + scan * 41) % 400) as u16),
             _ => Some(WALL_MM),
@@ -442,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn single_wrong_readings_are_nothing() {
+    fn single_wrong_reading_has_no_effect() {
         let wrong = |one: usize| {
             mask(move |beam, slice, scan| match beam {
                 7 if slice == 2 && (scan == 3 || scan == one) => Some(100),
@@ -450,24 +456,24 @@ mod tests {
             })
         };
         assert_eq!(wrong(3), Mask { of_beams: COUNT, ..Mask::default() });
-        // Twice in a slice is something; not a body.
+        // Two readings in a slice are an object, but not a body.
         assert_eq!(wrong(30), Mask { moving: vec![sector(7, 7, 100)], of_beams: COUNT, ..Mask::default() });
     }
 
     #[test]
-    fn the_circle_is_around_the_robot_wherever_the_sensor_sits() {
-        // 0.8 m ahead of the centre and looking back: what is 1.7 m off is 0.9 m behind the centre.
+    fn circle_is_around_the_robot_at_every_pose_of_the_sensor() {
+        // The sensor is 0.8 m ahead of the center and points back, so a range of 1.7 m is 0.9 m behind the center.
         let pose = Pose { x_m: 0.8, yaw_rad: std::f64::consts::PI, ..Pose::default() };
         let wall = |range_mm: u16| move |beam, _, _| if beam == 180 { Some(range_mm) } else { None };
         assert_eq!(learn(pose, 1000.0, wall(1700)).sectors, [sector(179, 181, 1850)]);
         assert_eq!(learn(pose, 1000.0, wall(1801)).sectors, []);
-        assert_eq!(learn(pose, 1000.0, wall(1800)).sectors, [], "on the circle is outside");
-        // As large a circle as there is: no range is beyond what a hub takes.
+        assert_eq!(learn(pose, 1000.0, wall(1800)).sectors, [], "a reading on the circle is outside");
+        // With the largest circle, no range exceeds the limit of a hub.
         assert_eq!(learn(Pose::default(), 65_000.0, wall(1800)).sectors, [sector(179, 181, FARTHEST_MM)]);
     }
 
     #[test]
-    fn a_slope_becomes_steps_and_a_fence_no_more_than_a_hub_takes() {
+    fn slope_becomes_steps_and_fence_becomes_the_maximum_number_of_sectors() {
         let slope = mask(|beam, _, _| if beam < 100 { Some(200 + 5 * beam as u16) } else { Some(WALL_MM) });
         assert_eq!(slope.sectors.len(), 10, "nine steps, and the edge");
         for pair in slope.sectors[..9].windows(2) {
@@ -488,35 +494,35 @@ mod tests {
     }
 
     #[test]
-    fn a_sensor_that_is_set_otherwise_meanwhile_is_noticed() {
+    fn detects_scan_of_another_shape() {
         let mut body = Body::new(Pose::default(), 1000.0);
         let scan =
             |count, unit_mm| Scan::of(ScanHead::lms(count, -90_000, 1000, unit_mm, 13), &vec![0; count]);
-        assert!(body.look(0, &scan(181, 1)) && !body.look(0, &scan(181, 10)));
-        assert!(!body.look(0, &scan(180, 1)) && body.look(SLICES, &scan(181, 1)));
+        assert!(body.add(0, &scan(181, 1)) && !body.add(0, &scan(181, 10)));
+        assert!(!body.add(0, &scan(180, 1)) && body.add(SLICES, &scan(181, 1)));
     }
 
     #[test]
-    fn a_scan_of_impossible_angles_does_no_harm() {
+    fn accepts_scan_with_impossible_angles() {
         for (first_angle, step) in [(1e300, 0.5), (0.0, 0.0), (-1e300, -1e-300)] {
             let mut body = Body::new(Pose::default(), 1000.0);
             let head = ScanHead { first_angle, step, ..ScanHead::lms(3, 0, 1000, 1, 13) };
             for slice in 0..SLICES {
-                assert!(body.look(slice, &Scan::of(head, &[400, 8191, 5000])));
+                assert!(body.add(slice, &Scan::of(head, &[400, 8191, 5000])));
             }
             assert_eq!(body.mask().of_beams, 3);
         }
     }
 
     #[test]
-    fn a_head_that_turns_clockwise_has_sectors_from_the_lesser_angle_on() {
+    fn sectors_of_clockwise_scanner_start_at_the_lower_angle() {
         let mut body = Body::new(Pose::default(), 1000.0);
         let mut scan = Scan::of(ScanHead::turning(scanhub_schema::Family::Ld, 360), &[WALL_MM; 360]);
-        // A post on the right, and one behind, across 180 degrees.
+        // One post is on the right, and one behind the sensor, across 180 degrees.
         scan.arrays().ranges[85..=95].fill(400);
         scan.arrays().ranges[175..=185].fill(400);
         for slice in 0..SLICES {
-            (0..SCANS).for_each(|_| assert!(body.look(slice, &scan)));
+            (0..SCANS).for_each(|_| assert!(body.add(slice, &scan)));
         }
         let sectors = body.mask().sectors;
         let seen: Vec<_> =

@@ -50,11 +50,11 @@ impl fmt::Display for Condition {
 /// Severity of a condition or an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// Nothing to say.
+    /// No error.
     Ok,
     /// For information.
     Info,
-    /// The sensor works, for now.
+    /// The scanner still works.
     Warning,
     /// The scanner does not work correctly.
     Error,
@@ -70,12 +70,12 @@ impl Severity {
             .copied()
     }
 
-    /// Returns its code.
+    /// Returns the code of the severity.
     pub fn code(self) -> u8 {
         self as u8
     }
 
-    /// Returns its name.
+    /// Returns the name of the severity.
     pub fn name(self) -> &'static str {
         match self {
             Severity::Ok => "ok",
@@ -92,33 +92,33 @@ impl Severity {
 pub struct StatusReport<'a>(&'a [u8; LEN]);
 
 impl<'a> StatusReport<'a> {
-    /// The report that `bytes` are; `None` if they are not 152.
+    /// Creates the view of the report in `bytes`. `None` if they are not 152.
     pub fn new(bytes: &'a [u8]) -> Option<StatusReport<'a>> {
         bytes.try_into().ok().map(StatusReport)
     }
 
-    /// The bytes as they came.
+    /// Returns the bytes as received.
     pub fn bytes(&self) -> &'a [u8; LEN] {
         self.0
     }
 
-    /// Firmware as ASCII, such as `V02.19`.
+    /// Returns the firmware version as ASCII, such as `V02.19`.
     pub fn software(&self) -> &'a [u8] {
         self.0[..7].trim_ascii()
     }
 
-    /// The operating mode, the byte after command 20h (24h: streaming, 25h: on request).
+    /// Returns the operating mode, the byte after command 20h (24h: streaming, 25h: on request).
     pub fn operating_mode(&self) -> u8 {
         self.0[7]
     }
 
-    /// Whether the sensor calls itself defective.
+    /// Returns whether the scanner reports that it is defective.
     pub fn is_defective(&self) -> bool {
         self.0[8] != 0
     }
 
-    /// What the dirtiest channel of the window lets through, in percent of when it was clean; `None` if nobody measured
-    /// that.
+    /// Returns the transmission of the window at its dirtiest channel, in percent of that of the clean window. `None`
+    /// if the clean window was never measured.
     pub fn window_percent(&self) -> Option<u16> {
         let percent = |channel| {
             let (is, was) = (self.word(18 + 2 * channel), self.word(42 + 2 * channel));
@@ -127,42 +127,42 @@ impl<'a> StatusReport<'a> {
         (0..CHANNELS).filter_map(percent).min().and_then(|percent| percent.try_into().ok())
     }
 
-    /// Laser power in percent of what it should be; a real one told 156 to 161.
+    /// Returns the laser power in percent of the nominal power. A real scanner reported 156 to 161.
     pub fn laser_power_percent(&self) -> u16 {
         self.word(82)
     }
 
-    /// How values are split.
+    /// Returns the measuring mode, which defines the bits of a value.
     pub fn mode(&self) -> Mode {
         Mode(self.0[101])
     }
 
-    /// Angle and resolution in force; `None` if the sensor names a pair that no telegram can carry.
+    /// Returns the current angle and resolution. `None` if no telegram can have this pair.
     pub fn variant(&self) -> Option<Variant> {
         Variant::new(self.word(106), self.word(108))
     }
 
-    /// Rate of the line; `None` for an unknown divisor.
+    /// Returns the baud rate of the line. `None` for an unknown divisor.
     pub fn baud(&self) -> Option<Baud> {
         baud_of_divisor(self.word(115))
     }
 
-    /// Whether the rate after power-on is another than 9600: byte 119, 0 is the factory's.
+    /// Returns whether the baud rate after power-on is not the factory's 9600 (byte 119, which the factory sets to 0).
     pub fn has_permanent_baud(&self) -> bool {
         self.0[118] != 0
     }
 
-    /// The sensor's own address.
+    /// Returns the scanner's address.
     pub fn address(&self) -> u8 {
         self.0[119]
     }
 
-    /// Unit of the ranges; `None` for an unknown code.
+    /// Returns the unit of the ranges. `None` for an unknown code.
     pub fn unit(&self) -> Option<Unit> {
         Unit::of_code(self.0[121])
     }
 
-    /// Whether the laser is on.
+    /// Returns whether the laser is on.
     pub fn is_laser_on(&self) -> bool {
         self.0[122] != 0
     }
@@ -172,25 +172,25 @@ impl<'a> StatusReport<'a> {
     }
 }
 
-/// What a simulated sensor says of itself in a status reply.
+/// State of a simulated scanner, for its status reply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Health {
-    /// Firmware, 7 ASCII characters.
+    /// Firmware version, 7 ASCII characters.
     pub software: [u8; 7],
-    /// The byte after the last 20h.
+    /// Operating mode, the byte after the last 20h.
     pub operating_mode: u8,
-    /// How values are split.
+    /// Measuring mode, which defines the bits of a value.
     pub mode: Mode,
-    /// Angle and resolution in force.
+    /// Current angle and resolution.
     pub variant: Variant,
     /// Unit of the ranges.
     pub unit: Unit,
-    /// Rate of the line.
+    /// Baud rate of the line.
     pub baud: Baud,
 }
 
 impl Health {
-    /// The settings in their places, a motor at its nominal speed, the laser on, everything else 0.
+    /// Returns a report with these settings, a motor at its nominal speed and the laser on. Everything else is 0.
     pub fn report(&self) -> [u8; LEN] {
         let mut data = [0; LEN];
         data[..7].copy_from_slice(&self.software);
@@ -206,7 +206,7 @@ impl Health {
     }
 }
 
-/// B1h: the settings of `health`, see [`Health::report`].
+/// Encodes the status reply B1h with the settings of `health`, see [`Health::report`].
 pub fn status(address: u8, health: &Health, status: u8) -> Encoded {
     Writer::new(address | REPLY, crate::lms::command::STATUS | REPLY)
         .slice(&health.report())
@@ -214,7 +214,7 @@ pub fn status(address: u8, health: &Health, status: u8) -> Encoded {
         .finish()
 }
 
-/// The word that stands for a rate: 16 MHz / (16 (n + 1)), with the upper bit set.
+/// Returns the divisor word of a baud rate, n with the upper bit set: the rate is 16 MHz / (16 (n + 1)).
 fn divisor_of(baud: Baud) -> u16 {
     match baud {
         Baud::B500000 => 0x8001,
@@ -224,12 +224,12 @@ fn divisor_of(baud: Baud) -> u16 {
     }
 }
 
-/// The rate that a word stands for.
+/// Returns the baud rate of a divisor word. `None` if it is unknown.
 pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
     Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
 }
 
-/// How the bytes of a value are read.
+/// Format of a value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// ASCII.
@@ -242,16 +242,16 @@ pub enum Kind {
     Bytes,
 }
 
-/// One value of the report: where it is and what it is.
+/// Position, format and name of a value in the report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Item {
-    /// Its first byte.
+    /// Offset of its first byte.
     pub at: usize,
-    /// Its bytes.
+    /// Length in bytes.
     pub len: usize,
-    /// Its name.
+    /// Name of the value.
     pub name: &'static str,
-    /// How it is read.
+    /// Format of the value.
     pub kind: Kind,
 }
 
@@ -259,7 +259,7 @@ const fn item(at: usize, len: usize, name: &'static str, kind: Kind) -> Item {
     Item { at, len, name, kind }
 }
 
-/// All values in their order, without gaps; the listing counts from the command byte, so its offsets are one more.
+/// All values in their order, without gaps. The listing counts from the command byte, so its offsets are higher by one.
 pub const ITEMS: [Item; 50] = [
     item(0, 7, "software version", Kind::Text),
     item(7, 1, "operating mode", Kind::Number),
@@ -313,12 +313,12 @@ pub const ITEMS: [Item; 50] = [
     item(150, 2, "calibration interval", Kind::Number),
 ];
 
-/// A window that lets through less than so many percent is dirty (Telegram listing, errors 18 and 19).
+/// Transmission in percent below which the window is dirty (Telegram listing, errors 18 and 19).
 pub(crate) const DIRTY: u16 = 75;
-/// Channels of the pollution measurement that look through the window; the others are its reference.
+/// Number of channels of the pollution measurement that measure the window. The others are its reference.
 const CHANNELS: usize = 8;
 
-/// LENGTH 9Ah less command and status (Telegram listing 7-5).
+/// Length of the report in bytes: LENGTH 9Ah without command and status (Telegram listing 7-5).
 pub const LEN: usize = 152;
 
 /// The errors of a reply.
@@ -331,7 +331,7 @@ impl<'a> Errors<'a> {
         bytes.len().is_multiple_of(2).then_some(Errors(bytes))
     }
 
-    /// The bytes as they came.
+    /// Returns the bytes as received.
     pub fn bytes(&self) -> &'a [u8] {
         self.0
     }
@@ -345,24 +345,24 @@ impl<'a> Errors<'a> {
 /// One error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Fault {
-    /// Its type: the severity, and 80h if it is past.
+    /// Error type: the severity, plus 80h if the error is past.
     pub kind: u8,
-    /// Its number.
+    /// Number of the error.
     pub number: u8,
 }
 
 impl Fault {
-    /// How bad it is; `None` for codes without a meaning.
+    /// Returns the severity. `None` for codes without a meaning.
     pub fn severity(self) -> Option<Severity> {
         Severity::of_code(self.kind & !PAST)
     }
 
-    /// Whether it is over, and only kept in memory; 10h clears it.
+    /// Returns whether the error has ended and is only in the error memory, which command 10h clears.
     pub fn is_past(self) -> bool {
         self.kind & PAST != 0
     }
 
-    /// What its number means; `None` for one that is not known here.
+    /// Returns the meaning of the number. `None` if it is unknown.
     pub fn meaning(self) -> Option<&'static str> {
         Some(match self.number {
             5 => "dazzled",
@@ -405,7 +405,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// Added to the type of an error that is over.
+/// Bit in the type of an error that has ended.
 const PAST: u8 = 0x80;
 
 #[cfg(test)]
@@ -417,7 +417,7 @@ mod tests {
     use crate::lms::telegram::Telegram;
 
     #[test]
-    fn every_bit_has_its_word() {
+    fn prints_every_bit_of_status_byte() {
         for (byte, words) in [
             (0x10, "ok"),
             (0x11, "info"),
@@ -442,7 +442,7 @@ mod tests {
     }
 
     #[test]
-    fn a_status_both_ways() {
+    fn encodes_and_reads_status() {
         for baud in Baud::ALL {
             let health = Health {
                 software: *b"V02.19 ",
@@ -467,8 +467,8 @@ mod tests {
     }
 
     #[test]
-    fn a_captured_list() {
-        // B2 84 16 (84 31)x8 84 16 01 31, less the eight.
+    fn reads_captured_errors() {
+        // Captured: B2 84 16 (84 31)x8 84 16 01 31. Repeated pairs are left out.
         let errors = Errors::new(&[0x84, 0x16, 0x84, 0x31, 1, 0x31]).unwrap();
         let words: Vec<_> = errors.iter().map(|fault| fault.to_string()).collect();
         assert_eq!(
