@@ -104,7 +104,7 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
     let bell = Bell::open(node, SENSOR)?.ok_or("no bell")?;
     let listener = match rest {
         Rest::Event => {
-            Some(scanhub_shm::listener(&scanhub_shm::open_wake(node, SENSOR)?.ok_or("no event")?)?)
+            Some(scanhub_shm::listener(node, &scanhub_shm::open_wake(node, SENSOR)?.ok_or("no event")?)?)
         }
         Rest::Awake | Rest::Bell => None,
     };
@@ -131,7 +131,7 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
 
 fn subscriber(node: &Node) -> Outcome<scanhub_shm::Subscriber<Scan>> {
     let service = Scan::open(node, SENSOR)?.ok_or("no topic")?;
-    Ok(Scan::subscriber(&service)?)
+    Ok(Scan::subscriber(node, &service)?)
 }
 
 fn wait_until(is_so: impl Fn() -> bool) {

@@ -119,7 +119,7 @@ impl BytesInlet {
         let node = scanhub_shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
         let wait = if task.way == Way::Event {
             let event = scanhub_shm::open_wake(&node, SENSOR)?.ok_or("no event")?;
-            Wait::Event(Box::new(scanhub_shm::listener(&event)?), false)
+            Wait::Event(Box::new(scanhub_shm::listener(&node, &event)?), false)
         } else {
             let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
             let rung = bell.rung(Ring::First);

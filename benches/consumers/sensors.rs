@@ -366,7 +366,7 @@ fn subscriber<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Subscrib
     let service = P::open(node, sensor)?;
     let service =
         service.ok_or_else(|| Failure::new(Kind::NoTopic, format!("{sensor} has no topics"), ""))?;
-    P::subscriber(&service)
+    P::subscriber(node, &service)
 }
 
 fn take<P: Payload + ?Sized>(subscriber: &Subscriber<P>) -> Outcome<usize> {

@@ -85,7 +85,8 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
             let hub = env.hub(&[env.link("front"), "--set=limits.consumers=3".to_owned()]);
             let node = scanhub_shm::client_node(&env.place()).expect("joins");
             let topic = Scan::open(&node, "front").expect("works").expect("is there");
-            let subscribers: Vec<_> = (0..3).map(|_| Scan::subscriber(&topic).expect("a place")).collect();
+            let subscribers: Vec<_> =
+                (0..3).map(|_| Scan::subscriber(&node, &topic).expect("a place")).collect();
             assert_eq!(env.subscribers("front/scan"), 3);
             let outcome = env.run(&["echo", "front/scan", "--json"]);
             let error = &outcome.of_class("error")[0];
@@ -112,7 +113,7 @@ fn a_consumer_without_a_place_is_told_the_flag() {
         sender.await_published(&mut program, &[Topic::Zones, Topic::Status]);
         let node = scanhub_shm::client_node(&env.place()).expect("joins");
         let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
-        let subscribers = [(); 2].map(|()| Zones::subscriber(&topic).expect("a place"));
+        let subscribers = [(); 2].map(|()| Zones::subscriber(&node, &topic).expect("a place"));
         let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
@@ -188,7 +189,7 @@ fn hold(place: &Domain) {
     let mut consumers = Vec::new();
     // Those that were killed before have their places until the hub looks after them.
     until("places", || {
-        consumers.extend(Scan::subscriber(&topic));
+        consumers.extend(Scan::subscriber(&node, &topic));
         consumers.len() == HELD
     });
     let mut held = Vec::new();

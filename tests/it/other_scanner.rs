@@ -245,7 +245,7 @@ fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reporte
     let driven = virtual_hub(&config, &domain, |links| {
         let node = scanhub_shm::client_node(&domain).expect("a node");
         let topic = Status::open(&node, "a").expect("a topic").expect("is there");
-        let statuses = Status::subscriber(&topic).expect("a subscriber");
+        let statuses = Status::subscriber(&node, &topic).expect("a subscriber");
         let mut reported = Vec::new();
         let mut note = |now: Nanos| {
             while let Ok(Some(sample)) = Status::receive(&statuses) {

@@ -87,7 +87,7 @@ fn angles_arrive_with_their_stamps_and_wake_who_sleeps() {
         let node = scanhub_shm::client_node(&env.place()).expect("a domain");
         let bell = Bell::open(&node, "mount").expect("it is ours").expect("it has one");
         let wake = scanhub_shm::open_wake(&node, "mount").expect("it is ours").expect("it has one");
-        let woken = scanhub_shm::listener(&wake).expect("room for one more");
+        let woken = scanhub_shm::listener(&node, &wake).expect("room for one more");
         let mut lives = Vec::new();
         let begin_ns = clock::now_ns();
         for (number, rate_rad_s) in [0.25, f64::NAN, -1.5].into_iter().enumerate() {

@@ -212,7 +212,7 @@ impl Drop for EndsPlayer {
 
 fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
     let topic = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(&topic).expect("a place")
+    P::subscriber(node, &topic).expect("a place")
 }
 
 fn take<P: Payload + ?Sized>(from: &Subscriber<P>, mut each: impl FnMut(u64, &P)) {

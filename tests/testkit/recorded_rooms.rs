@@ -123,7 +123,7 @@ impl Subscribers {
 
 fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
     let service = P::open(node, sensor).expect("a topic").expect("is there");
-    P::subscriber(&service).expect("a place")
+    P::subscriber(node, &service).expect("a place")
 }
 
 fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, bytes: impl Fn(&P) -> Vec<u8>) {

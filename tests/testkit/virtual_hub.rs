@@ -158,6 +158,15 @@ impl Platform for VirtualPlatform<'_> {
         SharedMemory::new(self.node, sensor, &TopicLimits::default())
     }
 
+    fn attached(&self) -> Option<u32> {
+        Some(self.waker.attached())
+    }
+
+    fn has_listeners(&self) -> bool {
+        // It counts the events.
+        true
+    }
+
     fn ring(&self, ring: Ring) {
         self.waker.ring(ring);
     }

@@ -155,7 +155,8 @@ impl Session {
         if let Some(readiness) = &self.readiness {
             joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
         }
-        let subscriber = P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&topic)).transpose()?;
+        let subscriber =
+            P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&joined.node, &topic)).transpose()?;
         self.subscribed_at = subscriber.as_ref().map(|_| Instant::now());
         Ok(subscriber)
     }

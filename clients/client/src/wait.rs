@@ -183,7 +183,7 @@ impl Sensor {
     /// Opens the event. Returns whether it exists.
     fn listen(&mut self, node: &Node) -> Result<bool, Failure> {
         let Some(service) = scanhub_shm::open_wake(node, &self.name)? else { return Ok(false) };
-        self.listener = Some(scanhub_shm::listener(&service)?);
+        self.listener = Some(scanhub_shm::listener(node, &service)?);
         Ok(true)
     }
 

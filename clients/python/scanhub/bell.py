@@ -1,5 +1,5 @@
-"""Three words in shared memory on which consumers in Rust and C sleep: "The doorbell" in docs/topics.md. This is the end that
-rings them. Refuses to know what was sent."""
+"""The doorbell of a sensor, a page in shared memory: "The doorbell" in docs/topics.md. A publisher rings its words, on
+which subscribers in Rust and C sleep. A subscriber announces itself there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,27 @@ import platform
 import stat
 
 from .errors import Denied, Failure, Short
+
+
+def announce(prefix: str, sensor: str) -> None:
+    """Counts at the doorbell of `sensor` that this process has attached to one of its services, so that the hub sends it
+    the next sample. Where this is not possible, the hub finds the subscriber within a second."""
+    futex = _FUTEX.get(platform.machine())
+    if futex is None:
+        return
+    try:
+        file = os.open(f"/dev/shm/{prefix}{sensor}.bell", os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return
+    try:
+        seen = os.fstat(file)
+        is_ours = stat.S_ISREG(seen.st_mode) and seen.st_uid == os.geteuid() and not seen.st_mode & 0o022
+        if is_ours and seen.st_size >= _PAGE:
+            _count(futex, (ctypes.c_uint32 * (_PAGE // 4)).from_buffer(mmap.mmap(file, _PAGE)), _ATTACHED)
+    except OSError:
+        pass
+    finally:
+        os.close(file)
 
 
 class Ringer:
@@ -30,23 +51,24 @@ class Ringer:
 
     def ring(self) -> None:
         """Counts one more and wakes all who sleep at the word of the topics that are no link's."""
-        self._count(_LAST)
+        _count(self._futex, self._words, _LAST)
 
     def close(self) -> None:
         """Says that nobody rings any more, and wakes all once more."""
         self._words[_CLOSED] = 1
         for word in (_FIRST, _LAST, _EARLY):
-            self._count(word)
+            _count(self._futex, self._words, word)
         try:
             os.unlink(self._path)
         except FileNotFoundError:
             pass
 
-    def _count(self, word: int) -> None:
-        """In one call of the kernel (FUTEX_WAKE_OP), which no processor reorders: who sees the new number sees what was
-        sent before."""
-        address = ctypes.c_void_p(ctypes.addressof(self._words) + 4 * word)
-        _syscall(ctypes.c_long(self._futex), address, _WAKE_OP, _ALL, None, address, _ADD_ONE)
+
+def _count(futex: int, words: ctypes.Array[ctypes.c_uint32], word: int) -> None:
+    """Adds 1 to a word and wakes all threads that sleep at it, in one system call (FUTEX_WAKE_OP). A process that sees
+    the new number also sees what was sent or attached before."""
+    address = ctypes.c_void_p(ctypes.addressof(words) + 4 * word)
+    _syscall(ctypes.c_long(futex), address, _WAKE_OP, _ALL, None, address, _ADD_ONE)
 
 
 def _opened(path: str) -> ctypes.Array[ctypes.c_uint32]:
@@ -79,7 +101,7 @@ def _in_the_way(path: str, seen: os.stat_result) -> Denied:
 
 
 _PAGE = 4096
-_FIRST, _CLOSED, _LAST, _EARLY = 0, 16, 32, 48
+_FIRST, _ATTACHED, _CLOSED, _LAST, _EARLY = 0, 1, 16, 32, 48
 """Positions of the words, of four bytes each."""
 _FUTEX = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
 """Number of the call futex(2) by the machine."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import iceoryx2 as iox2
 
-from . import counter, layout, prefix, trouble
+from . import bell, counter, layout, prefix, trouble
 from .errors import Held, NoHub, Short
 from .names import Domain, TopicName, of_service
 from .sample import Sample
@@ -62,15 +62,22 @@ class Membership(Kept):
         return self._node.service_builder(iox2.ServiceName.new(name))
 
     def listen(self, event: str) -> Any | None:
-        """The listener of an event, or None until a hub has made it. Raises Failure, Short."""
+        """The listener of an event, or None until a hub has made it. Announced to the hub. Raises Failure, Short."""
         factory = self.open(event, self.service(event).event(), "an event")
-        return factory and self.port(event, factory.listener_builder())
+        return factory and self._announced(event, factory.listener_builder())
 
     def subscribe(self, name: TopicName, kind: type[Sample]) -> Port | None:
-        """The subscriber of a topic, or None until a hub has made it. Raises Mismatch, Short, Failure."""
+        """The subscriber of a topic, or None until a hub has made it. The hub sends it the next sample. Raises Mismatch,
+        Short, Failure."""
         builder = self.service(name.service).publish_subscribe(payload(kind)).user_header(layout.Header)
         factory = self.open(name.service, builder, trouble.types(kind.element or kind.struct))
-        return factory and Port(name, kind, self.port(name.service, factory.subscriber_builder()))
+        return factory and Port(name, kind, self._announced(name.service, factory.subscriber_builder()))
+
+    def _announced(self, service: str, builder: Any) -> Any:
+        """Makes a port, and announces it to the publisher of `service`."""
+        port = self.port(service, builder)
+        bell.announce(self.prefix, service.split("/")[2])
+        return port
 
     def open(self, name: str, builder: Any, ours: str) -> Any | None:
         """Opens a service of types `ours`; one that is not there, or just being made or removed, is nothing."""

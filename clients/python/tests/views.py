@@ -118,8 +118,22 @@ def what_is_closed_ends(scans: scanhub.Subscription) -> None:
     assert list(scans) == [] and np.array_equal(kept, before)
 
 
+def a_subscriber_announces_itself(scans: scanhub.Subscription) -> None:
+    def attached() -> int:
+        with open(f"/dev/shm/{scans._membership.prefix}front.bell", "rb") as page:
+            return int.from_bytes(page.read(8)[4:], sys.byteorder)
+
+    next(scans)
+    before = attached()
+    with scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20) as others:
+        next(others)
+        # The subscriber, and the listener of the event.
+        assert attached() == before + 2
+
+
 domain, root = sys.argv[1:]
 for check in (
+    a_subscriber_announces_itself,
     views_are_the_hubs_memory,
     views_cannot_be_written,
     a_view_keeps_its_sample,

@@ -157,6 +157,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
                 self.output.topics.wake(Wake::Status);
             }
             self.save_background(false);
+            self.output.topics.look();
             self.diagnosis.note_line(self.stats.health());
             self.diagnosis
                 .note_starved_subscribers(self.output.topics.starved_subscribers(self.stats.is_streaming()));

@@ -3,7 +3,8 @@
 //! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
 //! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
 //! same path, `LinkOutput::publish_scan`: decode, zones, send, ring, the other processors, send. The last ring follows
-//! when all samples of the telegram are sent. Nothing on this path allocates, locks or logs.
+//! when all samples of the telegram are sent. The background learns after it, if neither background nor foreground has
+//! a subscriber. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
@@ -14,7 +15,6 @@ use scanhub_schema::{
 use crate::early::{EarlyMessage, EarlyWarner};
 use crate::pipeline::{Pipeline, ResultBuffers};
 use crate::platform::Platform;
-use crate::publisher::Loan;
 use crate::topics::Topics;
 
 /// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
@@ -108,14 +108,17 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         let measured_ns = recorded.measured_ns;
         let publish = |scan| self.publish_scan(scan, measured_ns, period_us, is_backlogged);
         let verdict_lifetime = whole.scan.as_ref().map(publish);
-        self.topics.wake(Wake::Telegram);
+        if verdict_lifetime.is_none() {
+            self.topics.wake(Wake::Telegram);
+        }
         Published { is_suspect: received.reasons != 0, verdict_lifetime }
     }
 
     /// Publishes packets that arrived together, and wakes their subscribers.
     pub(crate) fn packets(&mut self, received: &Received<'_>, recorded: &RecordedMetadata) -> Published {
         self.set_recorded_time(recorded);
-        self.topics.packets(received);
+        // A packet has no period, only its scan has.
+        self.topics.telegram(received, 0);
         self.topics.wake_for_packets();
         Published { is_suspect: received.reasons != 0, verdict_lifetime: None }
     }
@@ -135,13 +138,11 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
             self.update_early_warning(Some(scan));
         }
         self.topics.begin_revolution(scan.first, scan.last, scan.reasons, period_us);
-        let verdict_lifetime = self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged);
-        self.topics.wake(Wake::Telegram);
-        verdict_lifetime
+        self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged)
     }
 
-    /// Publishes a scan and the results that are computed from it. Subscribers to scan and zones are woken before the
-    /// other results are computed; the caller wakes the rest. A result without a subscriber is computed only if the
+    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of scan and zones
+    /// are woken before the other results are computed. A result without a subscriber is computed only if the
     /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is
     /// given. Returns how long the verdict is valid.
     fn publish_scan(
@@ -173,36 +174,48 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         topics.publishers.zones.send(zones, &header, &mut topics.due);
         topics.ring(Ring::First);
 
-        // The other processors.
+        // Marks, lines and motion.
         let mut marks = topics.publishers.marks.loan(0);
         let mut lines = topics.publishers.lines.loan(0);
         let mut motion = topics.publishers.motion.loan(0);
-        let len = Foreground::len(scan.beams());
-        let mut foreground = pipeline.has_background().then(|| topics.publishers.foreground.loan(len));
         let results = ResultBuffers {
             marks: marks.payload_mut(),
             lines: lines.payload_mut(),
             motion: motion.payload_mut(),
-            foreground: foreground.as_mut().and_then(Loan::payload_mut),
         };
         let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
-        let reset = pipeline.process(scan, measured_ns, raw.period, results);
-
-        // Send.
+        pipeline.process(scan, measured_ns, raw.period, results);
         topics.publishers.marks.send(marks, &header, &mut topics.due);
         topics.publishers.lines.send(lines, &header, &mut topics.due);
         topics.publishers.motion.send(motion, &header, &mut topics.due);
-        if let Some(foreground) = foreground {
-            topics.publishers.foreground.send(foreground, &header, &mut topics.due);
-        }
-        if pipeline.publishes_every_scan() || pipeline.is_background_due() {
-            self.send_background(&header);
-        }
 
+        // The background. Subscribers to other topics do not wait for it if its own topics have no subscriber.
+        if topics.publishers.foreground.has_subscribers() || topics.publishers.background.has_subscribers() {
+            self.update_background(&header);
+            self.topics.wake(Wake::Telegram);
+        } else {
+            self.topics.wake(Wake::Telegram);
+            self.update_background(&header);
+            self.topics.ring(Ring::Last);
+        }
+        self.note_published(raw, period_us)
+    }
+
+    /// Updates the background from the scan, and sends foreground and background.
+    fn update_background(&mut self, header: &Header) {
+        let LinkOutput { topics, pipeline, scan, .. } = self;
+        if !pipeline.has_background() {
+            return;
+        }
+        let mut foreground = topics.publishers.foreground.loan(Foreground::len(scan.beams()));
+        let reset = pipeline.learn(scan, foreground.payload_mut());
+        topics.publishers.foreground.send(foreground, header, &mut topics.due);
+        if pipeline.publishes_every_scan() || pipeline.is_background_due() {
+            self.send_background(header);
+        }
         if let Some(reason) = reset {
             tracing::warn!("{}: the background is learned again: {reason}", self.link.name);
         }
-        self.note_published(raw, period_us)
     }
 
     /// Updates what depends on the last scan. Returns how long the verdict on it is valid.
@@ -225,6 +238,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         decode(raw, &mut self.scan);
         self.pipeline.check_zones(&self.scan, None);
         self.pipeline.process(&self.scan, measured_ns, raw.period, ResultBuffers::default());
+        self.pipeline.learn(&self.scan, None);
     }
 
     /// Resets what the processors know of consecutive scans, after a silence that was not published.

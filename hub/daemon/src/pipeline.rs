@@ -67,13 +67,12 @@ impl fmt::Display for BackgroundReset {
     }
 }
 
-/// Payloads for the results of a scan other than zones. `None`: the topic has no subscriber, or there is no memory.
+/// Payloads for marks, lines and motion of a scan. `None`: the topic has no subscriber, or there is no memory.
 #[derive(Default)]
 pub(crate) struct ResultBuffers<'a> {
     pub(crate) marks: Option<&'a mut Marks>,
     pub(crate) lines: Option<&'a mut Lines>,
     pub(crate) motion: Option<&'a mut Motion>,
-    pub(crate) foreground: Option<&'a mut Foreground>,
 }
 
 impl Pipeline {
@@ -130,16 +129,10 @@ impl Pipeline {
         self.zones.update(scan, out.unwrap_or(&mut self.scratch.zones));
     }
 
-    /// Computes all other results of `scan`, which was measured at `stamp_ns`, `period_ns` after the scan before. Only
-    /// differences of stamps count, so a replay passes the times of the recording. Returns a reason if the background does
-    /// not fit the scan and starts again.
-    pub(crate) fn process(
-        &mut self,
-        scan: &Scan,
-        stamp_ns: u64,
-        period_ns: u64,
-        out: ResultBuffers<'_>,
-    ) -> Option<BackgroundReset> {
+    /// Computes marks, lines and motion of `scan`, which was measured at `stamp_ns`, `period_ns` after the scan before.
+    /// Only differences of stamps count, so a replay passes the times of the recording. Call
+    /// [`learn`](Self::learn) after it.
+    pub(crate) fn process(&mut self, scan: &Scan, stamp_ns: u64, period_ns: u64, out: ResultBuffers<'_>) {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
         }
@@ -160,7 +153,17 @@ impl Pipeline {
                 }
             }
         }
-        self.background.as_mut()?.update(scan, out.foreground, &mut self.scratch.foreground)
+    }
+
+    /// Updates the background model from `scan`, and computes its foreground. The model learns even without a
+    /// subscriber, because later subscribers and the next hub need what it has learned. Returns a reason if the model
+    /// does not fit the scan and starts again.
+    pub(crate) fn learn(
+        &mut self,
+        scan: &Scan,
+        foreground: Option<&mut Foreground>,
+    ) -> Option<BackgroundReset> {
+        self.background.as_mut()?.update(scan, foreground, &mut self.scratch.foreground)
     }
 
     /// Returns the number of reads per telegram while early warnings have a subscriber.
@@ -360,13 +363,12 @@ mod tests {
         let mut pipeline = pipeline(&processing(|_| {}));
         let mut zones = Zones::default();
         for _ in 0..20 {
-            assert_eq!(pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default()), None);
+            assert_eq!(pipeline.learn(&wall(361, 1, 3000), None), None);
         }
         let mut foreground = Foreground::of(361);
         let near = wall(361, 1, 500);
-        let out = ResultBuffers { foreground: Some(&mut foreground), ..ResultBuffers::default() };
         pipeline.check_zones(&near, Some(&mut zones));
-        assert_eq!(pipeline.process(&near, 0, 0, out), None);
+        assert_eq!(pipeline.learn(&near, Some(&mut foreground)), None);
         assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
         assert_eq!(foreground.segments().len(), 1, "segments are those of this scan");
         let mut stale = Zones::default();
@@ -378,7 +380,7 @@ mod tests {
     fn a_generation_is_new_until_it_is_published() {
         let mut pipeline = pipeline(&processing(|_| {}));
         assert!(!pipeline.is_background_due(), "nothing was learned yet");
-        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        pipeline.learn(&wall(361, 1, 3000), None);
         assert!(pipeline.is_background_due());
         assert_eq!((shown(&mut pipeline).generation, pipeline.is_background_due()), (0, false));
         for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
@@ -396,18 +398,18 @@ mod tests {
     #[test]
     fn a_model_that_has_learned_enough_is_published_again() {
         let mut pipeline = pipeline(&processing(|_| {}));
-        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        pipeline.learn(&wall(361, 1, 3000), None);
         assert_eq!(shown(&mut pipeline).taught, 0);
         for _ in 0..3 {
-            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+            pipeline.learn(&wall(361, 1, 3000), None);
             assert!(!pipeline.is_background_due());
         }
-        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        pipeline.learn(&wall(361, 1, 3000), None);
         assert!(pipeline.is_background_due());
         assert_eq!((shown(&mut pipeline).taught, pipeline.is_background_due()), (361, false));
         pipeline.handle("a", Verb::Freeze, &Box::<Background>::default()).expect("is kept");
         for _ in 0..9 {
-            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+            pipeline.learn(&wall(361, 1, 3000), None);
         }
         assert!(!pipeline.is_background_due(), "a frozen model stays as it is");
     }
@@ -420,7 +422,7 @@ mod tests {
         let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
         let (first, is_news) = (shown(&mut pipeline), pipeline.is_background_due());
         assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
-        let reason = pipeline.process(&wall(361, 10, 300), 0, 0, ResultBuffers::default());
+        let reason = pipeline.learn(&wall(361, 10, 300), None);
         assert_eq!(
             reason,
             Some(BackgroundReset::Shape(Mismatch { model: (181, 10_000), sensor: (361, 10_000) }))
@@ -430,31 +432,24 @@ mod tests {
         assert_eq!(refusal.kind, Kind::Configuration);
         let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
         assert_eq!(refusal.message, words);
-        assert!(
-            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default()).is_some(),
-            "another unit"
-        );
+        assert!(pipeline.learn(&wall(361, 1, 3000), None).is_some(), "another unit");
         let mut turned = wall(361, 1, 3000);
         turned.first_angle = -1.0;
         shown(&mut pipeline);
-        assert_eq!(pipeline.process(&turned, 0, 0, ResultBuffers::default()), Some(BackgroundReset::Angles));
-        assert_eq!(
-            (pipeline.is_background_due(), pipeline.process(&turned, 0, 0, ResultBuffers::default())),
-            (true, None)
-        );
+        assert_eq!(pipeline.learn(&turned, None), Some(BackgroundReset::Angles));
+        assert_eq!((pipeline.is_background_due(), pipeline.learn(&turned, None)), (true, None));
     }
 
     #[test]
     fn other_settings_keep_the_background() {
         let mut pipeline = pipeline(&processing(|_| {}));
         for _ in 0..20 {
-            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+            pipeline.learn(&wall(361, 1, 3000), None);
         }
         let told = |pipeline: &mut Pipeline, range| {
             let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
-            let out = ResultBuffers { foreground: Some(&mut foreground), ..ResultBuffers::default() };
             pipeline.check_zones(&wall(361, 1, range), Some(&mut zones));
-            assert_eq!(pipeline.process(&wall(361, 1, range), 0, 0, out), None);
+            assert_eq!(pipeline.learn(&wall(361, 1, range), Some(&mut foreground)), None);
             (zones.verdict(), foreground.beams)
         };
         let known = shown(&mut pipeline);
@@ -478,7 +473,7 @@ mod tests {
     #[test]
     fn a_request_without_a_background_names_the_key() {
         let mut pipeline = pipeline(&processing(|processing| processing.background.is_kept = false));
-        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        pipeline.learn(&wall(361, 1, 3000), None);
         assert!(
             !pipeline.has_background() && !pipeline.is_background_due() && !pipeline.publishes_every_scan()
         );

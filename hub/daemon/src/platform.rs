@@ -68,6 +68,13 @@ pub trait Platform {
     /// Returns the errors of [`SharedMemory::new`](scanhub_shm::SharedMemory::new).
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
 
+    /// Returns a number that changes when a subscriber or listener of the link may have attached. It may miss those of
+    /// other libraries than this project's. `None` if it is unknown.
+    fn attached(&self) -> Option<u32>;
+
+    /// Returns whether the event of the link has a listener.
+    fn has_listeners(&self) -> bool;
+
     /// Rings the doorbell word `ring` of the link, which wakes the subscribers that sleep there.
     fn ring(&self, ring: Ring);
 

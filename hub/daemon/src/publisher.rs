@@ -1,5 +1,9 @@
 //! Publisher of one topic of a link. It takes the loan for a sample before the sample arrives, so that a telegram does
 //! not have to wait for memory.
+//!
+//! iceoryx2 has the list of subscribers in a page of its own for each topic, and each send visits the slots of all
+//! possible subscribers. After a pause, none of this is in the processor's cache. The publisher therefore stores how
+//! many subscribers its topic had at the last [look](PreparedPublisher::look), and uses iceoryx2 only if it had any.
 
 use scanhub_schema::limits::history;
 use scanhub_schema::{Failure, Header};
@@ -9,10 +13,11 @@ use crate::platform::Platform;
 
 /// Publisher of one topic, which takes a loan before the sample arrives.
 ///
-/// A topic without a history is not sent while it has no subscriber, and its number is skipped. Sending visits the
-/// slots of all possible subscribers, and after a pause none of them is in the processor's cache.
+/// A topic without a history is not sent while it has no subscriber, and its number is skipped.
 pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
     topic: TopicPublisher<P, M>,
+    /// Number of subscribers at the last look.
+    subscribers: usize,
     /// Subscribers that got the last sample.
     reached: usize,
     /// Loan for the next sample, with the length of the last one.
@@ -38,16 +43,24 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// Returns [`Kind::Short`](scanhub_schema::Kind::Short) if no memory or descriptors are left.
     pub(crate) fn new(platform: &impl Platform<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
         let topic = TopicPublisher::over(platform.medium::<P>(sensor)?);
-        Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })
+        Ok(PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 })
     }
 
-    /// Takes a loan for the sample that is about to arrive, as long as the last one, and connects new subscribers.
+    /// Counts the subscribers of the topic, and connects new ones. Those of a topic with a history are connected
+    /// by [`connect`](Self::connect) or with the next sample.
+    pub(crate) fn look(&mut self) {
+        self.subscribers = self.topic.subscribers();
+        if self.subscribers > 0 && history(P::TOPIC) == 0 {
+            self.connect();
+        }
+    }
+
+    /// Takes a loan for the sample that is about to arrive, as long as the last one, if the topic has a subscriber. This
+    /// also brings the slots of the subscribers into the cache.
     pub(crate) fn prepare(&mut self) {
         if self.prepared.is_none() && self.is_wanted() {
             self.prepared = self.topic.loan(self.last_len).ok();
         }
-        // Connects now instead of while the telegram waits. It also brings the slots into the cache.
-        self.connect();
     }
 
     /// Takes a loan for the next sample. `len` is its size in bytes if the payload has no fixed size.
@@ -70,6 +83,9 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
                 if let Ok(reached) = self.topic.send_loan(loan, header) {
                     self.reached = reached;
                     due.note(P::TOPIC, reached);
+                    if reached < self.subscribers {
+                        self.note_departure();
+                    }
                 }
             }
             Loan::Lacking => self.topic.fail(),
@@ -78,7 +94,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     }
 
     /// Skips the number of a sample that is not sent, because the topic has no subscriber.
-    pub(crate) fn skip(&mut self) {
+    fn skip(&mut self) {
         self.topic.skip(1);
         self.reached = 0;
     }
@@ -88,9 +104,9 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
         self.topic.failed()
     }
 
-    /// Returns whether the topic has a subscriber.
+    /// Returns whether the topic had a subscriber at the last look.
     pub(crate) fn has_subscribers(&self) -> bool {
-        self.topic.subscribers() > 0
+        self.subscribers > 0
     }
 
     /// Returns whether a subscriber got the last sample.
@@ -101,7 +117,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// Returns the number of attached subscribers that did not get the last sample.
     pub(crate) fn undelivered(&self) -> usize {
         let has_begun = self.topic.next_number() > 0;
-        if has_begun { self.topic.subscribers().saturating_sub(self.reached) } else { 0 }
+        if has_begun { self.subscribers.saturating_sub(self.reached) } else { 0 }
     }
 
     /// Connects new subscribers, and gives them the history of the topic.
@@ -112,8 +128,14 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     }
 
     /// Returns whether samples are sent: the topic has a subscriber, or a history for later ones.
-    fn is_wanted(&self) -> bool {
-        history(P::TOPIC) > 0 || self.has_subscribers()
+    pub(crate) fn is_wanted(&self) -> bool {
+        history(P::TOPIC) > 0 || self.subscribers > 0
+    }
+
+    /// Counts the subscribers again, because one did not get a sample: it has left, or cannot be connected.
+    #[cold]
+    fn note_departure(&mut self) {
+        self.subscribers = self.topic.subscribers();
     }
 }
 
@@ -135,5 +157,83 @@ impl<P: Payload + ?Sized, M: Medium<P>> Loan<P, M> {
             Loan::Taken(loan) => Some(M::payload_mut(loan)),
             Loan::Lacking | Loan::Unwanted => None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+    use std::convert::Infallible;
+    use std::fmt::Debug;
+    use std::rc::Rc;
+
+    use scanhub_schema::Marks;
+    use scanhub_shm::{LoanError, SendError};
+
+    use super::*;
+
+    /// A topic that counts the calls of its functions.
+    #[derive(Clone, Default)]
+    struct CountingMedium {
+        subscribers: Rc<Cell<usize>>,
+        calls: Rc<Cell<usize>>,
+    }
+
+    impl CountingMedium {
+        fn count(&self) {
+            self.calls.set(self.calls.get() + 1);
+        }
+    }
+
+    impl Medium<Marks> for CountingMedium {
+        type Loan = Box<Marks>;
+
+        fn subscribers(&self) -> usize {
+            self.count();
+            self.subscribers.get()
+        }
+
+        fn connect(&self) -> Result<(), impl Debug + use<>> {
+            self.count();
+            Ok::<(), Infallible>(())
+        }
+
+        fn loan(&self, _: usize) -> Result<Box<Marks>, LoanError> {
+            self.count();
+            Ok(Box::default())
+        }
+
+        fn payload_mut(loan: &mut Box<Marks>) -> &mut Marks {
+            loan
+        }
+
+        fn send(&self, _: Box<Marks>, _: &Header) -> Result<usize, SendError> {
+            self.count();
+            Ok(self.subscribers.get())
+        }
+    }
+
+    #[test]
+    fn uses_a_topic_only_while_it_has_a_subscriber() {
+        let medium = CountingMedium::default();
+        let topic = TopicPublisher::over(medium.clone());
+        let mut publisher =
+            PreparedPublisher { topic, subscribers: 0, reached: 0, prepared: None, last_len: 0 };
+        let publish = |publisher: &mut PreparedPublisher<Marks, CountingMedium>| {
+            let mut due = DueRings::default();
+            publisher.prepare();
+            let loan = publisher.loan(0);
+            publisher.send(loan, &Header::default(), &mut due);
+            medium.calls.take()
+        };
+        publisher.look();
+        assert_eq!((medium.calls.take(), publish(&mut publisher)), (1, 0));
+        medium.subscribers.set(2);
+        publisher.look();
+        assert_eq!((medium.calls.take(), publish(&mut publisher)), (2, 2), "one loan, one send");
+        assert_eq!((publisher.reached, publisher.undelivered()), (2, 0));
+        medium.subscribers.set(0);
+        assert_eq!(publish(&mut publisher), 3, "the last subscriber has left");
+        assert_eq!((publish(&mut publisher), publisher.topic.next_number()), (0, 4));
     }
 }

@@ -255,6 +255,14 @@ impl Platform for System<'_> {
         Ok(medium)
     }
 
+    fn attached(&self) -> Option<u32> {
+        self.name.get().map(|name| name.waker.attached())
+    }
+
+    fn has_listeners(&self) -> bool {
+        self.name.get().is_some_and(|name| name.waker.has_listeners())
+    }
+
     fn ring(&self, ring: Ring) {
         if let Some(name) = self.name.get() {
             name.waker.ring(ring);

@@ -31,6 +31,11 @@ macro_rules! publishers {
                 Ok(Publishers { $($name: PreparedPublisher::new(platform, sensor)?,)* })
             }
 
+            /// Checks which topics have subscribers, and connects new ones.
+            fn look(&mut self) {
+                $(self.$name.look();)*
+            }
+
             /// Prepares the topics that are published with every scan.
             fn prepare(&mut self) {
                 $(if is_of_scan(Topic::$topic) {
@@ -45,7 +50,7 @@ macro_rules! publishers {
                 })*
             }
 
-            /// Returns whether any topic that `counts` has a subscriber.
+            /// Returns whether any topic that `counts` had a subscriber at the last look.
             fn has_subscribers(&self, counts: impl Fn(Topic) -> bool) -> bool {
                 $(counts(Topic::$topic) && self.$name.has_subscribers())||*
             }
@@ -82,9 +87,12 @@ pub(crate) struct Topics<'a, S: Platform> {
     last_telegram: LastStamps,
     last_revolution: LastStamps,
     next_seq: u64,
-    /// Whether packets have a subscriber, as of `checked_at`.
-    has_packet_subscribers: bool,
-    checked_at: Nanos,
+    /// [`Platform::attached`] at the last look for subscribers.
+    attached: Option<u32>,
+    /// Whether the event of the link had a listener at the last look.
+    has_listeners: bool,
+    /// Whether subscribers may have attached that did not get the history.
+    is_history_due: bool,
 }
 
 impl<'a, S: Platform> Topics<'a, S> {
@@ -104,8 +112,9 @@ impl<'a, S: Platform> Topics<'a, S> {
             last_telegram: LastStamps::default(),
             last_revolution: LastStamps::default(),
             next_seq: 0,
-            has_packet_subscribers: false,
-            checked_at: 0,
+            attached: None,
+            has_listeners: false,
+            is_history_due: false,
         })
     }
 
@@ -124,33 +133,37 @@ impl<'a, S: Platform> Topics<'a, S> {
         (self.header.wall_ns, self.header.flags, self.is_recorded) = (wall_ns, flags, true);
     }
 
+    /// Looks for subscribers if any may have attached since the last look. Called before samples are sent: a new
+    /// subscriber gets the next sample, and without one, this is one look at one word for all topics.
+    fn note_attached(&mut self) {
+        let attached = self.platform.attached();
+        if attached.is_none() || attached != self.attached {
+            self.attached = attached;
+            self.look();
+        }
+    }
+
+    /// Looks for the subscribers of all topics and the listeners of the event. Subscribers that were attached by another
+    /// library than this project's are found only here.
+    #[cold]
+    pub(crate) fn look(&mut self) {
+        self.publishers.look();
+        self.has_listeners = self.platform.has_listeners();
+        self.is_history_due = true;
+    }
+
     /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of its
-    /// scan.
+    /// scan. Connects new subscribers now instead of while the telegram waits.
     pub(crate) fn prepare(&mut self) {
+        self.note_attached();
         self.publishers.prepare();
     }
 
-    /// Publishes a telegram. Later samples have its number and its stamps, until the next telegram.
+    /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the next
+    /// telegram.
     pub(crate) fn telegram(&mut self, received: &Received<'_>, period_us: u32) {
         self.begin_telegram(received, period_us);
         self.publishers.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
-    }
-
-    /// Does the same as [`telegram`](Self::telegram) for packets. There are many, and few programs subscribe to them,
-    /// so the hub checks for subscribers only every 20 ms.
-    pub(crate) fn packets(&mut self, received: &Received<'_>) {
-        // A packet has no period, only its scan has.
-        self.begin_telegram(received, 0);
-        let packets = &mut self.publishers.telegram;
-        if received.last >= self.checked_at + SUBSCRIBER_CHECK_INTERVAL {
-            self.checked_at = received.last;
-            self.has_packet_subscribers = packets.has_subscribers();
-        }
-        if self.has_packet_subscribers {
-            packets.send_bytes(received.bytes, &self.header, &mut self.due);
-        } else {
-            packets.skip();
-        }
     }
 
     fn begin_telegram(&mut self, received: &Received<'_>, period_us: u32) {
@@ -170,6 +183,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     fn begin(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+        self.note_attached();
         let now = self.platform.now();
         (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recorded {
@@ -204,6 +218,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         reasons: u8,
         period_us: u32,
     ) {
+        self.note_attached();
         let now = self.platform.now();
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         let mut header = Header {
@@ -225,12 +240,13 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.publishers.early.send(early, &header, &mut self.due);
         if self.due.take(Ring::Early) {
             self.platform.ring(Ring::Early);
-            self.platform.notify_event(Wake::Early);
+            self.notify_event(Wake::Early);
         }
     }
 
     /// Sends zones as of `now`, without a scan. `write` writes them, even if there is no memory for the sample.
     pub(crate) fn send_zones(&mut self, now: u64, write: impl FnOnce(&mut Zones)) {
+        self.note_attached();
         let mut zones = self.publishers.zones.loan(0);
         write(zones.payload_mut().unwrap_or(&mut Zones::default()));
         let header = self.header_at(now);
@@ -244,6 +260,7 @@ impl<'a, S: Platform> Topics<'a, S> {
         len: usize,
         write: impl FnOnce(&mut Background),
     ) {
+        self.note_attached();
         let mut background = self.publishers.background.loan(len);
         match background.payload_mut() {
             Some(payload) => write(payload),
@@ -254,6 +271,7 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
+        self.note_attached();
         let mut sample = self.publishers.status.loan(0);
         if let Some(payload) = sample.payload_mut() {
             *payload = *status;
@@ -266,7 +284,13 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// last sample.
     pub(crate) fn wake(&mut self, why: Wake) {
         Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
-        self.platform.notify_event(why);
+        self.notify_event(why);
+    }
+
+    fn notify_event(&self, why: Wake) {
+        if self.has_listeners {
+            self.platform.notify_event(why);
+        }
     }
 
     /// Wakes the subscribers of the packets that were just published. Subscribers of scans alone are not woken.
@@ -284,21 +308,26 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Gives new subscribers the history that they would otherwise get with the next sample.
-    pub(crate) fn deliver_history(&self) {
-        self.publishers.deliver_history();
+    pub(crate) fn deliver_history(&mut self) {
+        self.note_attached();
+        if std::mem::take(&mut self.is_history_due) {
+            self.publishers.deliver_history();
+        }
     }
 
-    /// Returns whether any topic has a subscriber.
-    pub(crate) fn has_subscribers(&self) -> bool {
+    /// Looks for subscribers, and returns whether any topic has one.
+    pub(crate) fn has_subscribers(&mut self) -> bool {
+        self.look();
         self.publishers.has_subscribers(|_| true)
     }
 
-    /// Returns whether any topic other than `status` has a subscriber. Otherwise the scanner may stop.
-    pub(crate) fn has_data_subscribers(&self) -> bool {
+    /// Looks for subscribers, and returns whether any topic other than `status` has one. Otherwise the scanner may stop.
+    pub(crate) fn has_data_subscribers(&mut self) -> bool {
+        self.look();
         self.publishers.has_subscribers(|topic| topic != Topic::Status)
     }
 
-    /// Returns whether `early` has a subscriber.
+    /// Returns whether `early` had a subscriber at the last look.
     pub(crate) fn has_early_subscribers(&self) -> bool {
         self.publishers.early.has_subscribers()
     }
@@ -308,9 +337,9 @@ impl<'a, S: Platform> Topics<'a, S> {
         self.publishers.failed()
     }
 
-    /// Returns the number of subscribers that are attached but did not get the last sample, because their descriptors
-    /// or those of the hub ran out. (Sending succeeds nevertheless.) The topics of scans count only while scans arrive
-    /// (`streaming`). Topics that are published after a change never count, because that is seldom.
+    /// Returns the number of subscribers that were attached at the last look but did not get the last sample, because
+    /// their descriptors or those of the hub ran out. (Sending succeeds nevertheless.) The topics of scans count only
+    /// while scans arrive (`streaming`). Topics that are published after a change never count, because that is seldom.
     pub(crate) fn starved_subscribers(&self, streaming: bool) -> usize {
         self.publishers.undelivered(|topic| match topic.row().pace {
             Pace::Scan => streaming,
@@ -387,10 +416,6 @@ fn header_without_telegram(last: &Header, now: u64, wall_ns: u64) -> Header {
         ..*last
     }
 }
-
-/// Interval between checks for subscribers of packets. A new subscriber gets its first packet after this time at the
-/// latest.
-const SUBSCRIBER_CHECK_INTERVAL: Nanos = 20 * MILLIS;
 
 #[cfg(test)]
 mod tests {

@@ -233,13 +233,13 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
     ready.recv_timeout(Duration::from_secs(60)).expect("the hub is up");
     let node = scanhub_shm::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
-    let subscriber = Scan::subscriber(&topic).expect("a subscriber");
+    let subscriber = Scan::subscriber(&node, &topic).expect("a subscriber");
     let followers = follow_all.then(|| {
         let marks = Marks::open(&node, "heap").expect("a topic").expect("is there");
         let foreground = Foreground::open(&node, "heap").expect("a topic").expect("is there");
         (
-            Marks::subscriber(&marks).expect("a subscriber"),
-            Foreground::subscriber(&foreground).expect("a subscriber"),
+            Marks::subscriber(&node, &marks).expect("a subscriber"),
+            Foreground::subscriber(&node, &foreground).expect("a subscriber"),
         )
     });
     // The rate, both questions, and what is made once.

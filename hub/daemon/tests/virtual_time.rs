@@ -56,7 +56,7 @@ fn bytes_with_times_become_samples_with_stamps() {
     let received = virtual_hub(&two_links(), &place.0, |links| {
         let node = scanhub_shm::client_node(&place.0).expect("a node");
         let service = Scan::open(&node, "b").expect("a topic").expect("is there");
-        let subscriber = Scan::subscriber(&service).expect("a subscriber");
+        let subscriber = Scan::subscriber(&node, &service).expect("a subscriber");
         let mut received = Vec::new();
         for number in 1..=3_u64 {
             let words = [100 * number as u16; 361];
@@ -89,13 +89,13 @@ fn what_nobody_follows_is_not_made_and_a_status_tells_that_it_streams() {
         let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
         assert_eq!(links[0].read(1, telegram.bytes()), 1);
         let marks = Marks::open(&node, "a").expect("a topic").expect("is there");
-        let marks = Marks::subscriber(&marks).expect("a subscriber");
+        let marks = Marks::subscriber(&node, &marks).expect("a subscriber");
         assert!(matches!(Marks::receive(&marks), Ok(None)), "it came too late");
         assert_eq!(links[0].read(2, telegram.bytes()), 1);
         let Ok(Some(sample)) = Marks::receive(&marks) else { panic!("no marks") };
         assert_eq!((sample.user_header().seq, sample.user_header().topic_seq), (1, 1));
         let status = Status::open(&node, "a").expect("a topic").expect("is there");
-        let status = Status::subscriber(&status).expect("a subscriber");
+        let status = Status::subscriber(&node, &status).expect("a subscriber");
         // A status goes out each second while nobody has anything to tell.
         for second in 1..=3 {
             links[0].read(second * 1_000_000_000, telegram.bytes());
@@ -143,6 +143,28 @@ impl Subscriber for Log {
 }
 
 #[test]
+fn a_subscriber_that_does_not_announce_itself_is_found_within_a_second() {
+    let place = Place::new('f');
+    let outcome = virtual_hub(&two_links(), &place.0, |links| {
+        let node = scanhub_shm::client_node(&place.0).expect("a node");
+        let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
+        assert_eq!(links[0].read(1, telegram.bytes()), 1);
+        let scans = Scan::open(&node, "a").expect("a topic").expect("is there");
+        let foreign = scans.subscriber_builder().create().expect("a subscriber");
+        let mut found_after = None;
+        for number in 1..=40_u64 {
+            assert_eq!(links[0].read(1 + number * 26_640_000, telegram.bytes()), 1);
+            if let Ok(Some(_)) = Scan::receive(&foreign) {
+                found_after = found_after.or(Some(number * 26_640_000));
+            }
+        }
+        found_after
+    });
+    let found_after = outcome.expect("it runs").expect("it was found");
+    assert!((26_640_001..1_100_000_000).contains(&found_after), "found after {found_after} ns");
+}
+
+#[test]
 fn a_rate_that_the_port_rejects_is_logged_once_and_the_scanner_is_found() {
     let place = Place::new('r');
     let sources = Sources { links: vec!["a=/dev/none,family=auto".to_owned()], ..Sources::default() };
@@ -152,7 +174,7 @@ fn a_rate_that_the_port_rejects_is_logged_once_and_the_scanner_is_found() {
         virtual_hub(&config, &place.0, |links| {
             let node = scanhub_shm::client_node(&place.0).expect("a node");
             let status = Status::open(&node, "a").expect("a topic").expect("is there");
-            let status = Status::subscriber(&status).expect("a subscriber");
+            let status = Status::subscriber(&node, &status).expect("a subscriber");
             links[0].reject(&[500_000, 921_600, 256_000]);
             // Bytes of no scanner, for several rounds of the search.
             for read in 1..=200 {

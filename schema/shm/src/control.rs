@@ -16,7 +16,7 @@ use scanhub_schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, 
 use crate::processes::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
-use crate::wake::{Listener, Notifier, WakeService, listener, notifier, open_event, take_wakeups};
+use crate::wake::{Listener, Notifier, WakeService, create_listener, notifier, open_event, take_wakeups};
 
 /// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
 pub struct ControlServer {
@@ -73,7 +73,7 @@ impl ControlServer {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(|error| no_port(&service, &error))?;
-        let (requests, responses) = (listener(&asked)?, notifier(&answered, EVENT)?);
+        let (requests, responses) = (create_listener(&asked)?, notifier(&answered, EVENT)?);
         Ok(ControlServer { server, requests, responses, control, _bells: [asked, answered] })
     }
 
@@ -137,7 +137,7 @@ impl ControlClient {
         let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
         let Some(asked) = open_event(node, CONTROL_REQUEST)? else { return Ok(None) };
         let Some(answered) = open_event(node, CONTROL_RESPONSE)? else { return Ok(None) };
-        let (requests, responses) = (notifier(&asked, EVENT)?, listener(&answered)?);
+        let (requests, responses) = (notifier(&asked, EVENT)?, create_listener(&answered)?);
         let builder = control.client_builder().initial_max_slice_len(REQUEST);
         let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
         let client = builder.create().map_err(|error| match error {

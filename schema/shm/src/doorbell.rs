@@ -5,6 +5,9 @@
 //! the next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes
 //! it.
 //!
+//! A fourth word counts how often a program has attached to one of the sensor's services. The hub reads this word
+//! instead of the lists of subscribers. iceoryx2 has one for each topic, each in a different page.
+//!
 //! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The
 //! tests run all of them.
 #![allow(unsafe_code)]
@@ -60,6 +63,12 @@ impl DoorbellRinger {
         ring(self.page.words().of(word));
     }
 
+    /// Returns how often a program has attached to a service of the sensor, modulo 2^32. The services have all
+    /// subscribers and listeners that were counted.
+    pub(crate) fn attached(&self) -> u32 {
+        rung(&self.page.words().attached)
+    }
+
     fn open(path: &Path) -> Result<Page, Refused> {
         loop {
             let mut options = OpenOptions::new();
@@ -83,6 +92,19 @@ impl Drop for DoorbellRinger {
         ring(words.of(Ring::Last));
         ring(words.of(Ring::Early));
         let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+/// Counts at the doorbell of `sensor` that this process has attached to one of the sensor's services, so that the hub
+/// sends it the next sample. If the doorbell does not exist or cannot be written, the hub finds the subscriber when it
+/// starts or within a second.
+pub(crate) fn note_attached(node: &Node, sensor: &str) {
+    let path = path(node, sensor);
+    if let Ok(file) = own(OpenOptions::new().read(true).write(true), &path)
+        && file.metadata().is_ok_and(|metadata| metadata.len() >= PAGE as u64)
+        && let Ok(page) = MmapOptions::new().len(PAGE).map_raw(&file)
+    {
+        note(&Page(page).words().attached);
     }
 }
 
@@ -166,11 +188,13 @@ pub fn sleep_at_bells(bells: &[(&Bell, Ring, u32)], until_ns: u64) -> Result<(),
     }
 }
 
-/// Words of the page, each on a separate cache line.
+/// Words of the page, each on a separate cache line. Only `attached` is next to `first`, because the hub uses both for
+/// each telegram, and `attached` seldom changes.
 #[repr(C)]
 struct Words {
     first: AtomicU32,
-    _apart: [u32; 15],
+    attached: AtomicU32,
+    _apart: [u32; 14],
     closed: AtomicU32,
     _far: [u32; 15],
     last: AtomicU32,
@@ -254,6 +278,11 @@ trait FutexWord {
 fn ring(rung: &impl FutexWord) {
     rung.fetch_add(1, Ordering::Release);
     rung.wake();
+}
+
+/// Increments the counter `attached`. A hub that sees the new count also sees what was attached before.
+fn note(attached: &impl FutexWord) {
+    attached.fetch_add(1, Ordering::Release);
 }
 
 /// Returns the counter `rung`. Everything that was sent before it was incremented can be received after this call.

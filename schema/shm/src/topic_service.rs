@@ -17,8 +17,9 @@ use iceoryx2::service::builder::publish_subscribe::{
 use iceoryx2::service::port_factory::publish_subscribe;
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Header, Kind, Topic, limits};
+use scanhub_schema::{Failure, Header, Kind, Topic, limits, of_service};
 
+use crate::doorbell::note_attached;
 use crate::processes::Node;
 use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher, open};
 use crate::shortage::check_client;
@@ -65,12 +66,12 @@ pub trait Payload: Debug + 'static {
     /// Returns [`Kind::DomainHeld`] if the topic already has a publisher.
     fn publisher(topic: &TopicService<Self>, limits: &TopicLimits) -> Result<Publisher<Self>, Failure>;
 
-    /// Returns a subscriber of a topic.
+    /// Returns a subscriber of a topic, and announces it to the hub, which sends it the next sample.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
-    fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
+    fn subscriber(node: &Node, topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
 
     /// Returns the oldest queued sample, or `None`.
     ///
@@ -160,14 +161,18 @@ macro_rules! payload {
                 $sized.create().map_err(|error| no_publisher(topic.name(), error))
             }
 
-            fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
+            fn subscriber(node: &Node, topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
                 check_client()?;
-                topic.subscriber_builder().create().map_err(|error| match error {
+                let subscriber = topic.subscriber_builder().create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
                         no_place(topic.name(), places::<Self>(topic))
                     }
                     other => no_port(topic.name(), &other),
-                })
+                })?;
+                if let Some((sensor, _)) = of_service(topic.name().as_str()) {
+                    note_attached(node, sensor);
+                }
+                Ok(subscriber)
             }
 
             fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {

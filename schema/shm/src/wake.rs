@@ -16,9 +16,9 @@ use iceoryx2::service::port_factory::event;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use scanhub_schema::{Failure, Kind, Ring, Topic, Wake, limits};
+use scanhub_schema::{Failure, Kind, Ring, Topic, Wake, limits, of_service};
 
-use crate::doorbell::DoorbellRinger;
+use crate::doorbell::{DoorbellRinger, note_attached};
 use crate::processes::Node;
 use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::check_client;
@@ -56,13 +56,24 @@ impl Waker {
         self.ringer.ring(ring);
     }
 
+    /// Returns a number that changes when a subscriber or listener of the sensor attaches by a library of this project.
+    /// Other programs may not change it.
+    pub fn attached(&self) -> u32 {
+        self.ringer.attached()
+    }
+
+    /// Returns whether the event has a listener.
+    pub fn has_listeners(&self) -> bool {
+        self.service.dynamic_config().number_of_listeners() > 0
+    }
+
     /// Sends the event `why` to its listeners.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Failed`] if it could not be sent to some of them.
     pub fn tell(&self, why: Wake) -> Result<(), Failure> {
-        if self.service.dynamic_config().number_of_listeners() == 0 {
+        if !self.has_listeners() {
             return Ok(());
         }
         let told = self.notifier.notify_with_custom_event_id(EventId::new(why as usize));
@@ -140,12 +151,21 @@ pub(crate) fn notifier(service: &WakeService, event: usize) -> Result<Notifier, 
     builder.create().map_err(|error| no_port(service.name(), &error))
 }
 
-/// Returns a listener of the event.
+/// Returns a listener of the event of a sensor, and announces it to the hub, which notifies it from the next event on.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
-pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
+pub fn listener(node: &Node, wake: &WakeService) -> Result<Listener, Failure> {
+    let listener = create_listener(wake)?;
+    if let Some((sensor, _)) = of_service(wake.name().as_str()) {
+        note_attached(node, sensor);
+    }
+    Ok(listener)
+}
+
+/// Returns a listener of any event.
+pub(crate) fn create_listener(wake: &WakeService) -> Result<Listener, Failure> {
     check_client()?;
     wake.listener_builder().create().map_err(|error| match error {
         ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),

@@ -22,7 +22,7 @@ fn a_scan_is_written_and_read_in_place() {
 
     let client = scanhub_shm::client_node(&place.domain).unwrap();
     let seen = Scan::open(&client, "front").unwrap().expect("the hub made it");
-    let subscriber = Scan::subscriber(&seen).unwrap();
+    let subscriber = Scan::subscriber(&hub, &seen).unwrap();
 
     let head = ScanHead { count: 2, valid_to: 12, ..ScanHead::default() };
     let mut sample = Scan::loan(&publisher, Scan::len(2, 0)).unwrap();
@@ -50,7 +50,7 @@ fn a_telegram_is_as_long_as_it_is() {
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = <[u8]>::create(&hub, "front", &LIMITS).unwrap();
     let publisher = <[u8]>::publisher(&topic, &LIMITS).unwrap();
-    let subscriber = <[u8]>::subscriber(&topic).unwrap();
+    let subscriber = <[u8]>::subscriber(&hub, &topic).unwrap();
     for length in [9, 814] {
         let bytes: Vec<u8> = (0..length).map(|i| i as u8).collect();
         publisher.loan_slice_uninit(length).unwrap().write_from_slice(&bytes).send().unwrap();
@@ -70,7 +70,7 @@ fn a_late_consumer_gets_the_last_status() {
         sample.payload_mut().baud = baud;
         assert_eq!(sample.send().unwrap(), 0);
     }
-    let subscriber = Status::subscriber(&topic).unwrap();
+    let subscriber = Status::subscriber(&hub, &topic).unwrap();
     scanhub_shm::UpdateConnections::update_connections(&publisher).unwrap();
     assert_eq!(Status::receive(&subscriber).unwrap().expect("history").baud, 38400);
     assert!(Status::receive(&subscriber).unwrap().is_none());
@@ -82,7 +82,7 @@ fn a_full_queue_drops_the_oldest_and_nobody_waits() {
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Scan::create(&hub, "front", &LIMITS).unwrap();
     let publisher = Scan::publisher(&topic, &LIMITS).unwrap();
-    let subscriber = Scan::subscriber(&topic).unwrap();
+    let subscriber = Scan::subscriber(&hub, &topic).unwrap();
     for seq in 0..100 {
         let mut sample = Scan::loan(&publisher, 0).unwrap();
         sample.user_header_mut().seq = seq;
@@ -128,10 +128,10 @@ fn limits_are_those_of_the_contract() {
     assert_eq!(most.check(), Ok(()));
     let crowded = Scan::create(&hub, "rear", &most).unwrap();
     let publisher = Scan::publisher(&crowded, &most).unwrap();
-    let all: Vec<_> = (0..250).map(|_| Scan::subscriber(&crowded).unwrap()).collect();
+    let all: Vec<_> = (0..250).map(|_| Scan::subscriber(&hub, &crowded).unwrap()).collect();
     Scan::loan(&publisher, 0).unwrap().send().unwrap();
     assert!(all.iter().all(|subscriber| Scan::receive(subscriber).unwrap().is_some()));
-    assert_eq!(Scan::subscriber(&crowded).unwrap_err().kind, Kind::Short);
+    assert_eq!(Scan::subscriber(&hub, &crowded).unwrap_err().kind, Kind::Short);
 }
 
 #[test]
@@ -141,12 +141,12 @@ fn a_topic_has_a_place_for_each_of_its_consumers_and_the_next_is_told_the_key() 
     let two = TopicLimits { consumers: 2, ..LIMITS };
     for (sensor, key) in [("front", "limits.consumers"), ("robot1.front", "--consumers")] {
         let topic = Scan::create(&hub, sensor, &two).unwrap();
-        let first = [Scan::subscriber(&topic).unwrap(), Scan::subscriber(&topic).unwrap()];
-        let refused = Scan::subscriber(&topic).unwrap_err();
+        let first = [Scan::subscriber(&hub, &topic).unwrap(), Scan::subscriber(&hub, &topic).unwrap()];
+        let refused = Scan::subscriber(&hub, &topic).unwrap_err();
         assert_eq!(refused.kind, Kind::Short);
         assert!(refused.message.contains("has 2 consumers") && refused.hint.contains(key), "{refused}");
         drop(first);
-        Scan::subscriber(&topic).unwrap();
+        Scan::subscriber(&hub, &topic).unwrap();
     }
 }
 
@@ -174,7 +174,7 @@ fn consumers_wake_for_every_reason() {
     let waker = Waker::new(&hub, "front").unwrap();
     let client = scanhub_shm::client_node(&place.domain).unwrap();
     let seen = scanhub_shm::open_wake(&client, "front").unwrap().expect("the hub made it");
-    let listener = scanhub_shm::listener(&seen).unwrap();
+    let listener = scanhub_shm::listener(&client, &seen).unwrap();
     let heard = || {
         let mut ids = Vec::new();
         listener.try_wait(|event| ids.push(event.id.as_value())).unwrap();

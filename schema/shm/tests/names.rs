@@ -148,8 +148,8 @@ fn at_the_longest_place_all_works() {
     let waker = Waker::new(&hub, &"s".repeat(24)).unwrap();
     let topic = Scan::create(&hub, "front", &TopicLimits::default()).unwrap();
     let (publisher, subscriber) =
-        (Scan::publisher(&topic, &TopicLimits::default()).unwrap(), Scan::subscriber(&topic).unwrap());
-    let listener = scanhub_shm::listener(waker.service()).unwrap();
+        (Scan::publisher(&topic, &TopicLimits::default()).unwrap(), Scan::subscriber(&hub, &topic).unwrap());
+    let listener = scanhub_shm::listener(&hub, waker.service()).unwrap();
     waker.wake(Wake::Telegram).unwrap();
     assert!(scanhub_shm::take_wakeups(&[&listener]).unwrap());
     assert_eq!(Scan::loan(&publisher, 0).unwrap().send().unwrap(), 1);

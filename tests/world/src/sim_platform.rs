@@ -137,6 +137,14 @@ impl Platform for SimPlatform<'_> {
         Ok(Carrier::new(&self.shared, &self.clock, self.number))
     }
 
+    fn attached(&self) -> Option<u32> {
+        Some(self.shared.board.borrow().changes)
+    }
+
+    fn has_listeners(&self) -> bool {
+        true
+    }
+
     fn ring(&self, ring: Ring) {
         if ring == Ring::First && self.shared.planted.is(Defect::OneRing) {
             self.is_owed.set(true);

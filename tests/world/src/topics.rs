@@ -55,6 +55,8 @@ pub(crate) struct Board {
     /// Loans that were not sent, and samples that are held, wait or are kept.
     loans: Rc<Cell<usize>>,
     samples: Rc<Cell<usize>>,
+    /// Number of times that subscribers of any sensor have attached or left.
+    pub(crate) changes: u32,
     /// No publisher gets memory.
     pub(crate) lacks_memory: bool,
 }
@@ -79,6 +81,7 @@ impl Board {
             sensors: (0..sensors).map(|_| Default::default()).collect(),
             loans: Rc::default(),
             samples: Rc::default(),
+            changes: 0,
             lacks_memory: false,
         }
     }
@@ -98,6 +101,7 @@ impl Board {
 
     /// What killed consumers left is removed.
     pub(crate) fn clean(&mut self) {
+        self.changes += 1;
         let channels = self.sensors.iter_mut().flatten();
         channels.for_each(|channel| channel.places.retain(|place| !place.is_dead));
     }
@@ -109,6 +113,7 @@ impl Board {
 
     /// A place for `consumer`, if there is one.
     pub(crate) fn attach(&mut self, sensor: usize, topic: Topic, consumer: Number) -> bool {
+        self.changes += 1;
         let places = &mut self.sensors[sensor][topic as usize].places;
         let has_room = places.len() < TopicLimits::default().consumers;
         if has_room {
@@ -119,6 +124,7 @@ impl Board {
 
     /// `consumer` leaves, or is killed.
     pub(crate) fn detach(&mut self, sensor: usize, topic: Topic, consumer: Number, is_killed: bool) {
+        self.changes += 1;
         let places = &mut self.sensors[sensor][topic as usize].places;
         if is_killed {
             places.iter_mut().for_each(|place| place.is_dead |= place.consumer == consumer);

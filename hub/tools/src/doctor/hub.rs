@@ -177,7 +177,7 @@ fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
     // The ports of remote sensors are on other machines.
     for sensor in scanhub_shm::sensors(domain)?.into_iter().filter(|sensor| !is_remote(sensor)) {
         let Some(topic) = Status::open(&node, &sensor)? else { continue };
-        subscribers.push(Status::subscriber(&topic)?);
+        subscribers.push(Status::subscriber(&node, &topic)?);
         found.push((sensor, None));
     }
     for _ in 0..POLLS {

@@ -290,3 +290,20 @@ fn a_consumer_that_sees_the_number_before_the_sample_is_found() {
     });
     assert!(lost > 0);
 }
+
+#[test]
+fn a_hub_that_sees_the_count_sees_who_attached() {
+    let lost = lost(|| {
+        let sensor = one();
+        let joiner = consumer(&sensor, |sensor| {
+            sensor.send(1);
+            note(&sensor.rung);
+            true
+        });
+        let is_counted = rung(&sensor.rung) == 1;
+        let is_there = sensor.sent.load(Ordering::Relaxed) == 1;
+        joiner.join().unwrap();
+        is_there || !is_counted && rung(&sensor.rung) == 1
+    });
+    assert_eq!(lost, 0);
+}
