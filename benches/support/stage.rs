@@ -72,7 +72,7 @@ impl Stage {
 
     /// Starts a simulator with idle sensors at ptys, at `rate`.
     pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
-        self.simulator(sensors, &self.truth(), &["--baud", &rate.to_string()])
+        self.simulator(sensors, Some(&self.truth()), &["--baud", &rate.to_string()])
     }
 
     /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It logs nothing.
@@ -82,12 +82,12 @@ impl Stage {
 
     /// Starts a simulator with sensors at ptys and more `flags`. It logs nothing.
     pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
-        self.simulator(sensors, Path::new("/dev/null"), flags)
+        self.simulator(sensors, None, flags)
     }
 
     /// Starts a simulator with one sensor and more `flags`. It logs to [`Stage::own_truth`].
     pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
-        self.simulator(&[sensor], &self.own_truth(sensor), flags)
+        self.simulator(&[sensor], Some(&self.own_truth(sensor)), flags)
     }
 
     /// Returns the path of the log of a sensor that has its own simulator.
@@ -95,13 +95,10 @@ impl Stage {
         self.directory.join(format!("truth-{sensor}"))
     }
 
-    fn simulator(&self, sensors: &[&str], truth: &Path, flags: &[&str]) -> Outcome<Child> {
-        let truth = truth.display().to_string();
-        let mut words: Vec<String> = ["simulate", "--seed", "1", "--truth", &truth]
-            .iter()
-            .chain(flags)
-            .map(|word| word.to_string())
-            .collect();
+    fn simulator(&self, sensors: &[&str], truth: Option<&Path>, flags: &[&str]) -> Outcome<Child> {
+        let mut words: Vec<String> =
+            ["simulate", "--seed", "1"].iter().chain(flags).map(|word| word.to_string()).collect();
+        words.extend(truth.iter().flat_map(|truth| ["--truth".into(), truth.display().to_string()]));
         words.extend(sensors.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]));
         let child = Child::start(PROGRAM, &words)?;
         child.await_line("ready", PATIENCE)?;

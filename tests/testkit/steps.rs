@@ -7,6 +7,7 @@
 #![allow(dead_code)] // The test needs a part of it.
 
 use std::collections::{BTreeMap, HashMap};
+use std::fs;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -285,6 +286,24 @@ impl Stepper {
 /// Returns an error if no telegram has arrived since `begun` for far too long.
 fn check(begun: Instant) -> Result<(), String> {
     if begun.elapsed() > PATIENCE { Err("no telegram was published".to_owned()) } else { Ok(()) }
+}
+
+/// Returns the ID of the thread of the link in the hub `pid`, which has the name of its sensor.
+///
+/// # Errors
+///
+/// Returns a message if the hub has no such thread, or has exited.
+pub(crate) fn link_thread(pid: u32, sensor: &str) -> Result<i32, String> {
+    let failed = |error: std::io::Error| format!("process {pid}: {error}");
+    for task in fs::read_dir(format!("/proc/{pid}/task")).map_err(failed)? {
+        let task = task.map_err(failed)?;
+        let name = fs::read_to_string(task.path().join("comm")).map_err(failed)?;
+        if name.trim() == sensor {
+            let thread = task.file_name().to_string_lossy().parse();
+            return thread.map_err(|_| format!("process {pid}: a thread ID is not a number"));
+        }
+    }
+    Err(format!("process {pid} has no thread {sensor}"))
 }
 
 fn lost(error: Errno) -> String {
