@@ -50,8 +50,8 @@ fn a_hub_that_was_stopped() {
     // Nothing that waited looks newer than it is, or it says that its stamp is an estimate: where the kernel's own
     // threads wait for a processor, the line falls silent before all that waited was read.
     let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-    let sample = |((&place, &stamp), line)| (truth[place].sent_ns, stamp, is_estimate(line));
-    let all: Vec<(u64, u64, bool)> = places.iter().zip(&stamps).zip(&lines).map(sample).collect();
+    let sample = |n: usize| (truth[places[n]].sent_ns, stamps[n], is_estimate(&lines[n]));
+    let all: Vec<(u64, u64, bool)> = (0..places.len()).map(sample).collect();
     let waited: Vec<_> = all.iter().filter(|(sent, ..)| (stopped..continued).contains(sent)).collect();
     let are_right = waited.iter().all(|(sent, stamp, is_estimate)| stamp < sent || *is_estimate);
     assert!(waited.len() > 10 && are_right, "{waited:?}");
