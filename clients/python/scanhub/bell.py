@@ -15,7 +15,7 @@ from .errors import Denied, Failure, Short
 
 def announce(prefix: str, sensor: str) -> None:
     """Counts at the doorbell of `sensor` that this process has attached to one of its services, so that the hub sends it
-    the next sample. Where this is not possible, the hub finds the subscriber within a second."""
+    the next sample. Where this is not possible, the hub finds the subscriber after a tenth of a second."""
     futex = _FUTEX.get(platform.machine())
     if futex is None:
         return

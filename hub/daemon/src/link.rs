@@ -21,7 +21,7 @@ pub(crate) struct LinkCore<'a, S: Platform> {
     pub(crate) stats: LinkStats,
     pub(crate) diagnosis: Diagnosis<'a>,
     pub(crate) control: ControlQueue,
-    /// Time at which new subscribers get the history.
+    /// Time at which the hub looks for subscribers of other libraries, and new subscribers get the history.
     next_history: Nanos,
     /// Time at which the status is published even if it has not changed.
     next_status: Nanos,
@@ -276,5 +276,6 @@ const SEARCH_LOG_PERIOD: Nanos = 60_000 * MILLIS;
 const POLL_INTERVAL: Nanos = 40 * MILLIS;
 /// Maximum time between two samples of the status.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
-/// Maximum time after which a new subscriber gets the history.
+/// Maximum time after which a new subscriber gets the history, and after which a subscriber that has not announced itself
+/// is found.
 const HISTORY_PERIOD: Nanos = 100 * MILLIS;

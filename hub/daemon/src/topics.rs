@@ -91,8 +91,6 @@ pub(crate) struct Topics<'a, S: Platform> {
     attached: Option<u32>,
     /// Whether the event of the link had a listener at the last look.
     has_listeners: bool,
-    /// Whether subscribers may have attached that did not get the history.
-    is_history_due: bool,
 }
 
 impl<'a, S: Platform> Topics<'a, S> {
@@ -114,7 +112,6 @@ impl<'a, S: Platform> Topics<'a, S> {
             next_seq: 0,
             attached: None,
             has_listeners: false,
-            is_history_due: false,
         })
     }
 
@@ -149,7 +146,6 @@ impl<'a, S: Platform> Topics<'a, S> {
     pub(crate) fn look(&mut self) {
         self.publishers.look();
         self.has_listeners = self.platform.has_listeners();
-        self.is_history_due = true;
     }
 
     /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of its
@@ -307,12 +303,11 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Gives new subscribers the history that they would otherwise get with the next sample.
+    /// Looks for subscribers, and gives new ones the history that they would otherwise get with the next sample.
+    #[cold]
     pub(crate) fn deliver_history(&mut self) {
-        self.note_attached();
-        if std::mem::take(&mut self.is_history_due) {
-            self.publishers.deliver_history();
-        }
+        self.look();
+        self.publishers.deliver_history();
     }
 
     /// Looks for subscribers, and returns whether any topic has one.

@@ -143,7 +143,7 @@ impl Subscriber for Log {
 }
 
 #[test]
-fn a_subscriber_that_does_not_announce_itself_is_found_within_a_second() {
+fn a_subscriber_that_does_not_announce_itself_is_found_within_a_tenth_of_a_second() {
     let place = Place::new('f');
     let outcome = virtual_hub(&two_links(), &place.0, |links| {
         let node = scanhub_shm::client_node(&place.0).expect("a node");
@@ -161,7 +161,8 @@ fn a_subscriber_that_does_not_announce_itself_is_found_within_a_second() {
         found_after
     });
     let found_after = outcome.expect("it runs").expect("it was found");
-    assert!((26_640_001..1_100_000_000).contains(&found_after), "found after {found_after} ns");
+    // A tenth of a second, the telegram after which the hub looks, and the next one.
+    assert!((26_640_001..154_000_000).contains(&found_after), "found after {found_after} ns");
 }
 
 #[test]

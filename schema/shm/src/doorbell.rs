@@ -97,7 +97,7 @@ impl Drop for DoorbellRinger {
 
 /// Counts at the doorbell of `sensor` that this process has attached to one of the sensor's services, so that the hub
 /// sends it the next sample. If the doorbell does not exist or cannot be written, the hub finds the subscriber when it
-/// starts or within a second.
+/// starts, or after a tenth of a second.
 pub(crate) fn note_attached(node: &Node, sensor: &str) {
     let path = path(node, sensor);
     if let Ok(file) = own(OpenOptions::new().read(true).write(true), &path)
