@@ -2,9 +2,9 @@
 //!
 //! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
 //! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
-//! same path, `LinkOutput::publish_scan`: decode, zones, send, ring, the other processors, send. The last ring follows
-//! when all samples of the telegram are sent. The background learns after it, if neither background nor foreground has
-//! a subscriber. Nothing on this path allocates, locks or logs.
+//! same path, `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as soon
+//! as the last of its topics that has a subscriber was sent. What no subscriber waits for follows after the last ring,
+//! such as a background that only learns. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
@@ -13,9 +13,9 @@ use scanhub_schema::{
 };
 
 use crate::early::{EarlyMessage, EarlyWarner};
-use crate::pipeline::{Pipeline, ResultBuffers};
+use crate::pipeline::{BackgroundReset, Pipeline, ResultBuffers};
 use crate::platform::Platform;
-use crate::topics::Topics;
+use crate::topics::{Publishers, Topics};
 
 /// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
 #[derive(Clone, Copy, Debug, Default)]
@@ -105,6 +105,9 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // A withdrawal has the sequence number that this telegram gets.
         self.withdraw(Some(whole.number));
         self.topics.telegram(received, period_us);
+        if !self.topics.publishers.scan.has_subscribers() && !self.topics.publishers.zones.has_subscribers() {
+            self.topics.ring(Ring::First);
+        }
         let measured_ns = recorded.measured_ns;
         let publish = |scan| self.publish_scan(scan, measured_ns, period_us, is_backlogged);
         let verdict_lifetime = whole.scan.as_ref().map(publish);
@@ -141,8 +144,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged)
     }
 
-    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of scan and zones
-    /// are woken before the other results are computed. A result without a subscriber is computed only if the
+    /// Publishes a scan and the results that are computed from it, and wakes the subscribers. Those of a stage are woken
+    /// before the results of the next stage are computed. A result without a subscriber is computed only if the
     /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is
     /// given. Returns how long the verdict is valid.
     fn publish_scan(
@@ -153,13 +156,22 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         is_backlogged: bool,
     ) -> Nanos {
         let LinkOutput { topics, pipeline, scan, .. } = self;
+        let last_awaited = Stage::last_awaited(topics);
 
-        // Decode. The sample is a copy, because the processors read the scan after the sample was sent.
+        // Decode and send the scan. The sample is a copy, because the processors read the scan after the sample was sent.
         let len = raw.payload_len();
         let mut scan_sample = topics.publishers.scan.loan(len);
         decode(raw, scan);
         if let Some(sample) = scan_sample.payload_mut() {
             sample.copy_from(scan.bytes());
+        }
+        let header = topics.header();
+        topics.publishers.scan.send(scan_sample, &header, &mut topics.due);
+        if !topics.publishers.zones.has_subscribers() {
+            topics.ring(Ring::First);
+        }
+        if last_awaited == Stage::Scan {
+            topics.wake(Wake::Telegram);
         }
 
         // Zones.
@@ -167,12 +179,11 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // A backlogged scan does not show the current surroundings of the robot.
         pipeline.zones.doubt(is_backlogged);
         pipeline.check_zones(scan, zones.payload_mut());
-
-        // Send and ring.
-        let header = topics.header();
-        topics.publishers.scan.send(scan_sample, &header, &mut topics.due);
         topics.publishers.zones.send(zones, &header, &mut topics.due);
         topics.ring(Ring::First);
+        if last_awaited == Stage::Zones {
+            topics.wake(Wake::Telegram);
+        }
 
         // Marks, lines and motion.
         let mut marks = topics.publishers.marks.loan(0);
@@ -188,15 +199,14 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         topics.publishers.marks.send(marks, &header, &mut topics.due);
         topics.publishers.lines.send(lines, &header, &mut topics.due);
         topics.publishers.motion.send(motion, &header, &mut topics.due);
+        if last_awaited == Stage::Motion {
+            topics.wake(Wake::Telegram);
+        }
 
-        // The background. Subscribers to other topics do not wait for it if its own topics have no subscriber.
-        if topics.publishers.foreground.has_subscribers() || topics.publishers.background.has_subscribers() {
-            self.update_background(&header);
+        // Foreground and background.
+        self.update_background(&header);
+        if last_awaited == Stage::Background {
             self.topics.wake(Wake::Telegram);
-        } else {
-            self.topics.wake(Wake::Telegram);
-            self.update_background(&header);
-            self.topics.ring(Ring::Last);
         }
         self.note_published(raw, period_us)
     }
@@ -214,7 +224,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
             self.send_background(header);
         }
         if let Some(reason) = reset {
-            tracing::warn!("{}: the background is learned again: {reason}", self.link.name);
+            log_reset(&self.link.name, reason);
         }
     }
 
@@ -222,7 +232,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
     fn note_published(&mut self, raw: &RawScan<'_>, period_us: u32) -> Nanos {
         let is_blind = self.pipeline.zones.is_blind();
         if is_blind && !self.is_blind {
-            tracing::warn!("{}: zones unknown: too few beams see into the largest circle", self.link.name);
+            log_blind(&self.link.name);
         }
         self.is_blind = is_blind;
         // The verdict is valid from now on: telegrams that had to wait for the hub are late, but scans do arrive.
@@ -391,6 +401,43 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         let (len, pipeline) = (self.pipeline.background_len(), &mut self.pipeline);
         self.topics.send_background(header, len, |background| pipeline.write_background(background));
     }
+}
+
+/// Stages of a scan's publication, in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stage {
+    Scan,
+    Zones,
+    /// Marks, lines and motion.
+    Motion,
+    /// Foreground and background.
+    Background,
+}
+
+impl Stage {
+    /// Returns the last stage whose topics have a subscriber; `Scan` if none has one. The event is sent after it.
+    fn last_awaited<S: Platform>(topics: &Topics<'_, S>) -> Stage {
+        let Publishers { zones, marks, lines, motion, foreground, background, .. } = &topics.publishers;
+        if foreground.has_subscribers() || background.has_subscribers() {
+            Stage::Background
+        } else if marks.has_subscribers() || lines.has_subscribers() || motion.has_subscribers() {
+            Stage::Motion
+        } else if zones.has_subscribers() {
+            Stage::Zones
+        } else {
+            Stage::Scan
+        }
+    }
+}
+
+#[cold]
+fn log_reset(link: &str, reason: BackgroundReset) {
+    tracing::warn!("{link}: the background is learned again: {reason}");
+}
+
+#[cold]
+fn log_blind(link: &str) {
+    tracing::warn!("{link}: zones unknown: too few beams see into the largest circle");
 }
 
 /// Writes `raw` into `scan`, which is reallocated once if it is too short.
