@@ -326,6 +326,20 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                 partial => core.output.update_early_warning(partial.as_ref()),
             }
         }
+        let is_streaming = session.state() == line::State::Streaming && core.stats.is_streaming();
+        // While telegrams arrive, only a telegram changes what the status reports.
+        if published || !is_streaming || core.is_due(now) {
+            self.report(core, open, now);
+        }
+        open.throttled_until =
+            open.allowance.as_mut().and_then(|allowance| allowance.rest(platform.now(), open.deadline));
+        Ok(())
+    }
+
+    /// Examines the session, and publishes and saves what has changed or is due.
+    fn report(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>, now: Nanos) {
+        let platform = core.platform;
+        let session = &mut open.session;
         self.identity.save_once_known(session);
         let (state, has_changed) = core.diagnosis.update(session, now);
         if has_changed && let Some(rate) = session.known_rate() {
@@ -344,9 +358,6 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         // While telegrams arrive, each one checks whether a status is due, so no extra wake-up is needed.
         let status_due = if state == State::Streaming { Nanos::MAX } else { core.next_status() };
         open.deadline = open.deadline.min(status_due);
-        open.throttled_until =
-            open.allowance.as_mut().and_then(|allowance| allowance.rest(platform.now(), open.deadline));
-        Ok(())
     }
 
     /// Returns whether bytes that arrived at `at` may have been buffered for an unknown time.
