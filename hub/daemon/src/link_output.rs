@@ -3,7 +3,7 @@
 //! A session returns telegrams with a scan, or packets and then the scan of a revolution. [`LinkOutput::telegram`],
 //! [`packets`](LinkOutput::packets) and [`revolution`](LinkOutput::revolution) publish them. All scans then take the
 //! same path, `LinkOutput::publish_scan`: decode, send, zones, send, the other processors, send. A doorbell rings as soon
-//! as the last of its topics that has a subscriber was sent. What no subscriber waits for follows after the last ring,
+//! as the last of its topics that has a subscriber was sent. Work without a waiting subscriber follows the last ring,
 //! such as a background that only learns. Nothing on this path allocates, locks or logs.
 
 use scanhub_config::{Link, Processing};
