@@ -8,13 +8,6 @@ mod generated;
 pub(crate) mod run;
 mod simulate;
 
-#[cfg(test)]
-#[path = "../tests/it/pages/blocks.rs"]
-mod blocks;
-#[cfg(test)]
-#[path = "../tests/it/pages/shell.rs"]
-mod shell;
-
 use std::path::PathBuf;
 
 use clap::error::ErrorKind;
@@ -152,6 +145,13 @@ pub(crate) fn family(text: &str) -> Result<Family, String> {
     let names = || Family::ALL.map(Family::name).join(", ");
     Family::parse(&text.to_lowercase()).ok_or_else(|| format!("one of {}, not {text:?}", names()))
 }
+
+#[cfg(test)]
+#[path = "../tests/it/pages/blocks.rs"]
+mod blocks;
+#[cfg(test)]
+#[path = "../tests/it/pages/shell.rs"]
+mod shell;
 
 #[cfg(test)]
 mod tests {

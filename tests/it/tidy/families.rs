@@ -5,7 +5,7 @@ use super::holds;
 use super::tree::{Tree, code};
 
 /// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 10] = [
+const MAY: [&str; 11] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
@@ -20,6 +20,8 @@ const MAY: [&str; 10] = [
     "clients/python/scanhub/scan.py",
     "clients/python/scanhub_lan.py",
     "clients/wireshark/scanhub.lua",
+    // An example in the help.
+    "hub/cli/simulate.rs",
 ];
 
 /// Words for a family, beside the name of its module.
