@@ -174,7 +174,9 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     // The recorder of the default topics began later, and ended later.
     let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
     let both = (recorded.len() - begin).min(replayed.len());
-    // On a busy machine, a recorder may miss samples. It counts them, and the scans of their turns differ.
+    // On a busy machine, a recorder may miss samples, and the line may lose bytes. Both are counted, and the scans of their
+    // turns differ.
+    let has_lost = env.truth("front").iter().any(|sent| sent.fault.is_some());
     let is_unbroken = |name: &str, topic: &str| {
         let numbers: Vec<u64> =
             samples(&env.path(name), topic).iter().map(|(header, _)| header.topic_seq).collect();
@@ -182,8 +184,10 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     };
     let topics =
         [("default.mcap", "front/telegram"), ("all.mcap", "front/scan"), ("replayed.mcap", "front/scan")];
-    if topics.into_iter().all(|(name, topic)| is_unbroken(name, topic)) {
-        assert!(both > 25 && recorded[begin..][..both] == replayed[..both], "{begin} {both}");
+    if !has_lost && topics.into_iter().all(|(name, topic)| is_unbroken(name, topic)) {
+        let differs =
+            recorded[begin..].iter().zip(&replayed).position(|(recorded, replayed)| recorded != replayed);
+        assert!(both > 25 && differs.is_none(), "{begin} {both}: {differs:?}");
     }
 
     let words = ["replay", "--json", "--no-system-config", "--hold", "--rate=max", &stream];
