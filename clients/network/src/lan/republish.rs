@@ -42,7 +42,7 @@ pub struct LeftOut {
     pub unannounced: u64,
     /// A newer sample was published before.
     pub late: u64,
-    /// There are [`MAX_SENSORS`] other sensors.
+    /// There are 16 other sensors, the maximum.
     pub capacity: u64,
     /// There was no memory or no descriptor for the topic.
     pub shortage: u64,
