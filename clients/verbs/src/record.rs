@@ -2,13 +2,13 @@
 //!
 //! The path of a sample, from top to bottom:
 //!
-//! 1. The topics: [`RecordArgs::run`] follows the selected ones, and [`Recorder::run`] receives their samples.
-//! 2. The queue ([`Queue`]) is bounded. A sample that finds no room is left out, counted, reported, and becomes part of a
-//!    [`Gap`] in the file.
-//! 3. The disk thread ([`Disk::run`]) takes the whole queue ten times a second. It alone touches the disk, so a slow, full or
+//! 1. The topics: `RecordArgs::run` follows the selected ones, and `Recorder::run` receives their samples.
+//! 2. The queue (`Queue`) is bounded. A sample that finds no room is left out, counted, reported, and becomes part of a
+//!    `Gap` in the file.
+//! 3. The disk thread (`Disk::run`) takes the whole queue ten times a second. It alone touches the disk, so a slow, full or
 //!    missing disk does not delay any live topic.
-//! 4. The file ([`Part`](part::Part)) makes a chunk of it and writes it. [`Files`] names the files and removes old ones.
-//! 5. The report ([`Report`]) prints the progress of the disk thread and the result.
+//! 4. The file (`Part`) makes a chunk of it and writes it. `Files` names the files and removes old ones.
+//! 5. The report (`Report`) prints the progress of the disk thread and the result.
 
 mod disk;
 mod files;
