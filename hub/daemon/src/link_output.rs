@@ -180,8 +180,9 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         pipeline.zones.doubt(is_backlogged);
         pipeline.check_zones(scan, zones.payload_mut());
         topics.publishers.zones.send(zones, &header, &mut topics.due);
-        topics.ring(Ring::First);
-        if last_awaited == Stage::Zones {
+        // A subscriber that attached during this scan may get the zones, which have a history.
+        let is_late = topics.ring(Ring::First) && last_awaited == Stage::Scan;
+        if is_late || last_awaited == Stage::Zones {
             topics.wake(Wake::Telegram);
         }
 
@@ -205,7 +206,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
 
         // Foreground and background.
         self.update_background(&header);
-        if last_awaited == Stage::Background {
+        if last_awaited == Stage::Background || self.topics.is_ring_due() {
             self.topics.wake(Wake::Telegram);
         }
         self.note_published(raw, period_us)

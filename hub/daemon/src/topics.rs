@@ -279,12 +279,15 @@ impl<'a, S: Platform> Topics<'a, S> {
     /// Wakes the subscribers that have received samples since they were last woken. Called once per telegram, after its
     /// last sample.
     pub(crate) fn wake(&mut self, why: Wake) {
-        Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
+        for ring in Ring::ALL {
+            self.ring(ring);
+        }
         self.notify_event(why);
     }
 
     fn notify_event(&self, why: Wake) {
-        if self.has_listeners {
+        // A listener may have attached since the last look, with a subscriber that the last sample reached.
+        if self.has_listeners || self.platform.attached() != self.attached {
             self.platform.notify_event(why);
         }
     }
@@ -296,11 +299,19 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
-    pub(crate) fn ring(&mut self, ring: Ring) {
-        if self.due.take(ring) {
+    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise. Returns
+    /// whether it did.
+    pub(crate) fn ring(&mut self, ring: Ring) -> bool {
+        let is_due = self.due.take(ring);
+        if is_due {
             self.platform.ring(ring);
         }
+        is_due
+    }
+
+    /// Returns whether a sample was sent whose doorbell has not rung yet.
+    pub(crate) fn is_ring_due(&self) -> bool {
+        self.due != DueRings::default()
     }
 
     /// Looks for subscribers, and gives new ones the history that they would otherwise get with the next sample.
