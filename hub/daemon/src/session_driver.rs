@@ -309,7 +309,9 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             open.settings_check.pass();
         }
         let now = platform.now();
-        if open.settings_check.is_due(session.state(), now) && restore(core, line, session.rate())? {
+        let is_altered =
+            open.settings_check.is_due(session.state(), now) && restore(core, line, session.rate())?;
+        if is_altered {
             open.backlog = None;
         }
         // Check for subscribers only once per scan: the check visits every subscriber slot of the topic.
@@ -327,8 +329,8 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             }
         }
         let is_streaming = session.state() == line::State::Streaming && core.stats.is_streaming();
-        // While telegrams arrive, only a telegram changes what the status reports.
-        if published || !is_streaming || core.is_due(now) {
+        // While telegrams arrive, only a telegram or another process changes what the status reports.
+        if published || is_altered || !is_streaming || core.is_due(now) {
             self.report(core, open, now);
         }
         open.throttled_until =

@@ -5,7 +5,7 @@
 //!
 //! - locations and files of a domain: `domain`, `shortage`, `directory`, `file_in_use`, `segments`
 //! - processes: `processes`
-//! - services: `service`, `topic_service`, `doorbell`, `wake`, `control`
+//! - services: `service`, `doorbell`, `topic_service`, `wake`, `control`
 
 mod control;
 mod directory;
