@@ -140,7 +140,9 @@ fn a_port_of_the_hub_is_found_by_any_of_its_names() {
         for check in ["holder", "sensor", "line-errors", "line-loss"] {
             let found = findings.iter().find(|line| line["name"] == check && line["port"] == name);
             let found = found.unwrap_or_else(|| panic!("no {check} of {name}: {findings:#?}"));
-            assert_eq!((&found["state"], &found["link"]), (&"ok".into(), &"front".into()), "{found}");
+            // On a busy machine, the simulator skips scans, which count as lost.
+            let is_expected = found["state"] == "ok" || check == "line-loss" && found["state"] == "warning";
+            assert!(is_expected && found["link"] == "front", "{found}");
         }
         for verb in [&["probe", name][..], &["configure", name, "unit=mm"]] {
             let outcome = in_directory(&[verb, &["--json"]].concat()).wait();
