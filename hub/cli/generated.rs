@@ -109,7 +109,7 @@ enum Name {
 /// A command line up to the cursor.
 #[derive(Debug, Default)]
 struct Line {
-    /// The name that comes next, if it is one of the hub.
+    /// Kind of the name that is expected next, if it is a name that the hub has.
     wanted: Option<Name>,
     /// Whether `robot`, all sensors together, is accepted too.
     takes_robot: bool,

@@ -92,7 +92,7 @@ struct Observations {
     duplicate: u64,
     /// Position of the sensor with each number, by the newest announcement.
     owners: BTreeMap<u8, usize>,
-    /// Time of arrival of the newest zones of each sensor.
+    /// Arrival time of each sensor's newest zones.
     heard_at: [Option<Nanos>; NAMES.len()],
     /// Sequence number of the datagram with the zones that have this value in `nearest_mm`.
     sequences: BTreeMap<u32, u64>,

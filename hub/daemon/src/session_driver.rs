@@ -314,7 +314,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         if is_altered {
             open.backlog = None;
         }
-        // Check for subscribers only once per scan: the check visits every subscriber slot of the topic.
+        // The number of reads changes only between two scans.
         if is_scan {
             self.reads_per_telegram = core.output.pieces();
         }

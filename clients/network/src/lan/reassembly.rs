@@ -35,7 +35,7 @@ const MAX_OF_TOPIC: usize = 4;
 const MAX_OF_ALL: usize = 64;
 
 impl Reassembler {
-    /// Takes a part from the sender `from`. `is_known` says whether its sample is a duplicate. Once the sample is
+    /// Takes a part from the sender `from`. `is_known` is true if its sample is a duplicate. Once the sample is
     /// complete, writes it to `whole`, and returns its header.
     pub(super) fn take(
         &mut self,

@@ -145,7 +145,7 @@ impl Sender {
     }
 }
 
-/// Detects that a gateway of a lower epoch goes on sending, unlike a gateway that was restarted, from whose previous
+/// Detects that a gateway of a lower epoch continues to send, unlike a gateway that was restarted, from whose previous
 /// run a few datagrams arrive late.
 #[derive(Default)]
 pub(super) struct DuplicateDetector {

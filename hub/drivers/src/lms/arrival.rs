@@ -219,9 +219,8 @@ impl Rhythm {
     }
 }
 
-/// How long before the expected end of a telegram the host reads again. It adapts to the lateness of sleeps and to the
-/// chunks of the line: the sleep should end before the last chunk of a telegram and after the one before it, so that the
-/// host waits once.
+/// Time between the end of the host's sleep and the expected end of a telegram. It adapts to the lateness of sleeps and to
+/// the chunks of the line. The sleep should end between the last two chunks of a telegram, so that the host waits once.
 #[derive(Clone, Copy, Debug)]
 pub struct Lead(Nanos);
 
@@ -241,8 +240,8 @@ impl Lead {
         self.0
     }
 
-    /// Handles a complete telegram, of which `reads` reads after the sleep returned bytes. After 1 it was complete before
-    /// the sleep ended.
+    /// Handles a complete telegram. `reads` is the number of reads that returned bytes after the sleep. If it is 1, the
+    /// telegram was complete before the sleep ended.
     pub fn adapt(&mut self, reads: u32) {
         match reads {
             1 => self.0 = (self.0 + Lead::RISE).min(Lead::MAX),
