@@ -145,7 +145,7 @@ fn packets_that_a_hub_recorded_are_sent_again() {
     let hub = env.hub(&[&env.link("front"), "--set=link.front.family=ld"]);
     env.await_info("front", |info| info["state"] == "streaming");
     let file = env.word("day.mcap");
-    let outcome = env.run(&["record", "-o", &file, "--for=1s"]);
+    let outcome = env.run(&["record", "-o", &file, "front/telegram", "-n", "200"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     for program in [hub, simulator] {
         assert_eq!(program.end(TERM).code, Some(0));

@@ -58,7 +58,7 @@ pub(crate) use terminal::{Sitting, can_sit, terminal};
 pub(crate) use tmux::Tmux;
 
 /// Limit of every wait. It only bounds a hang: no test depends on how long something takes.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(180);
 
 /// Flag of a simulator whose sensors take as long to answer as real ones do.
 pub(crate) const REAL_ANSWERS: &str = "--fault=answer=0";

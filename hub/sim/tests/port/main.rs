@@ -29,7 +29,7 @@ use scanhub_sim::simulate::Record;
 use bench::{Folder, Host, Simulator};
 
 /// Limit of every wait. It only bounds a hang.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(180);
 
 fn options(port: PathBuf) -> SimulateOptions {
     let baud = Some(Baud::B500000);
