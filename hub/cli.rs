@@ -12,7 +12,7 @@ use std::path::PathBuf;
 
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
-use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{Arg, ArgMatches, Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use scanhub_network as network;
 use scanhub_perception::verbs as perception;
 use scanhub_schema::{Failure, Family};
@@ -40,23 +40,41 @@ impl Cli {
     pub(crate) fn of_process() -> Result<Cli, clap::Error> {
         let mut command = Cli::command();
         let matches = command.try_get_matches_from_mut(std::env::args_os())?;
-        if let Some(("demo", _)) = matches.subcommand() {
-            refuse_hub(&mut command, &matches)?;
-        }
+        refuse_hub(&mut command, &matches)?;
+        refuse_json(&mut command, &matches)?;
         Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
     }
 }
 
-/// Returns an error if the command line of `demo` names a hub. A domain in the environment names the user's usual hub,
-/// so `demo` ignores it.
+/// Returns an error if the command line names a hub for a verb that runs its own. A domain in the environment names the
+/// user's usual hub, so these verbs ignore it.
 fn refuse_hub(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::Error> {
     let is_given = |id: &&str| matches.value_source(id) == Some(ValueSource::CommandLine);
+    let (name, verb, remedy) = match matches.subcommand() {
+        Some(("demo", _)) => ("demo", "demo", "; demo shows the name of its domain"),
+        Some(("web", web)) if web.contains_id("replay") => ("web", "web --replay", ""),
+        _ => return Ok(()),
+    };
     let Some(id) = ["domain", "root"].into_iter().find(is_given) else { return Ok(()) };
     let message = format!(
-        "demo runs its own hub in its own domain, and cannot be used with --{id}\n\n  \
-         tip: leave out --{id}; demo shows the name of its domain"
+        "{verb} runs its own hub in its own domain, and cannot be used with --{id}\n\n  \
+         tip: leave out --{id}{remedy}"
     );
-    let command = command.find_subcommand_mut("demo").expect("a verb");
+    let command = command.find_subcommand_mut(name).expect("a verb");
+    Err(command.error(ErrorKind::ArgumentConflict, message))
+}
+
+/// Returns an error if `--json` stands before a verb whose flags conflict with it. clap checks only those after the verb.
+fn refuse_json(command: &mut Command, matches: &ArgMatches) -> Result<(), clap::Error> {
+    let Some((name, own)) = matches.subcommand().filter(|_| matches.get_flag("json")) else { return Ok(()) };
+    let command = command.find_subcommand_mut(name).expect("a verb");
+    let conflicts =
+        |arg: &Arg| command.get_arg_conflicts_with(arg).iter().any(|other| other.get_id() == "json");
+    let is_given = |arg: &&Arg| own.value_source(arg.get_id().as_str()) == Some(ValueSource::CommandLine);
+    let Some(flag) = command.get_arguments().filter(is_given).find(|arg| conflicts(arg)) else {
+        return Ok(());
+    };
+    let message = format!("the argument '{flag}' cannot be used with '--json'");
     Err(command.error(ErrorKind::ArgumentConflict, message))
 }
 

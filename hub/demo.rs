@@ -64,8 +64,7 @@ impl Demo {
     /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
     /// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
     pub(crate) fn run(&self, context: &mut Context) -> Result<(), Failure> {
-        // Without a picture, the demonstration may outlive its terminal.
-        let stop = if self.headless { context.signals.stop()? } else { context.signals.any_end()? };
+        let stop = context.signals.any_end()?;
         let json = context.json;
         let shows = !self.headless && !json;
         let has_picture = shows && can_show_pictures();
@@ -90,7 +89,7 @@ impl Demo {
         drop(web);
         stage.print_errors();
         let (account, end) = played?;
-        account.summary(&mut context.out, json);
+        crate::print_own(&account.summary(json).join("\n"))?;
         if end == End::Hurried {
             return Err(Failure::new(Kind::Interrupted, "interrupted before all telegrams had arrived", ""));
         }

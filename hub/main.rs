@@ -84,7 +84,10 @@ impl Signals for ProcessSignals {
     }
 
     fn any_end(&self) -> Result<Arc<AtomicBool>, Failure> {
-        flag(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT])
+        match scanhub_daemon::is_hangup_ignored() {
+            true => flag(&[SIGINT, SIGTERM, SIGQUIT]),
+            false => flag(&[SIGINT, SIGTERM, SIGHUP, SIGQUIT]),
+        }
     }
 
     fn report(&self) -> Result<Arc<AtomicBool>, Failure> {

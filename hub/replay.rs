@@ -90,8 +90,7 @@ impl Replay {
         drop(console);
         let played = played?;
         mounts.transpose()?;
-        crate::say(&if context.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) });
-        Ok(())
+        crate::print(&if context.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) })
     }
 
     /// The options of the player.

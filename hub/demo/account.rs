@@ -2,7 +2,6 @@
 //! by their hash, so a damaged telegram counts as lost.
 
 use std::collections::{HashMap, HashSet};
-use std::io::Write;
 use std::time::{Duration, Instant};
 
 use scanhub_drivers::features;
@@ -227,8 +226,9 @@ impl Account {
         Some(format!("{what} {were} sent and not received: {causes}"))
     }
 
-    /// Prints the summary, one line for each sensor.
-    pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) {
+    /// Returns the summary, one line for each sensor.
+    pub(crate) fn summary(&self, json: bool) -> Vec<String> {
+        let mut lines = Vec::new();
         for sensor in &self.sensors {
             let (sent, lost) = (sensor.sent, sensor.lost());
             let summary = Summary {
@@ -247,8 +247,8 @@ impl Account {
                 lost_on_line: sensor.lost_on_line(),
                 missed: sensor.missed,
             };
-            let line = if json {
-                serde_json::to_string(&summary).unwrap_or_default()
+            lines.push(if json {
+                crate::line(&summary)
             } else {
                 format!(
                     "{:6} {}: {} sent, {} received, {lost} lost in {:.1} s, {} on the line, {} missed, {} Hz, \
@@ -265,12 +265,10 @@ impl Account {
                     summary.hub_cpu_percent,
                     summary.eeprom_writes,
                 )
-            };
-            let _ = out.write_all(format!("{line}\n").as_bytes());
+            });
         }
-        if let Some(tilted) = &self.tilted {
-            let _ = out.write_all(format!("{}\n", tilted.line(json)).as_bytes());
-        }
+        lines.extend(self.tilted.as_ref().map(|tilted| tilted.line(json)));
+        lines
     }
 
     /// Returns the results of three-dimensional perception as text.

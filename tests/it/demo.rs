@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Program, is_there, number, output, shared_memory, until};
+use crate::testkit::{HUP, INT, Outcome, Program, is_there, number, output, shared_memory, until};
 use crate::web::{channels, view};
 
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
@@ -159,6 +159,12 @@ fn refuses_hub_on_the_command_line_and_ignores_that_of_the_environment() {
         assert!(line["hint"].as_str().is_some_and(|hint| hint.starts_with("leave out")), "{refused}");
     }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(["web", "--replay", "walk.mcap", "--domain", "other"]).env_clear();
+    let refused = Program::start(command).wait();
+    assert_eq!(refused.code, Some(2), "{refused}");
+    assert!(refused.errors.contains("web --replay runs its own hub in its own domain"), "{refused}");
+
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("SCANHUB_DOMAIN", "other");
     let outcome = Program::start(command).wait();
     let ready = &outcome.of_class("ready")[0];
@@ -208,15 +214,17 @@ fn people_are_followed_from_room_to_room_in_the_house() {
 
 #[test]
 fn interrupted() {
-    // Its processes are there, and all of them go.
-    let outcome = demo(&["--headless", "--json"], |program| {
-        let name = format!("demo-{}", program.pid());
-        until("hub, simulator and consumers", || processes(&name).len() >= 4);
-        until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
-        program.end(INT)
-    });
-    let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
-    ends_as_counted(&outcome, lost);
+    // All of its processes end. SIGHUP is the signal of a terminal that is closed.
+    for signal in [INT, HUP] {
+        let outcome = demo(&["--headless", "--json"], |program| {
+            let name = format!("demo-{}", program.pid());
+            until("hub, simulator and consumers", || processes(&name).len() >= 4);
+            until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
+            program.end(signal)
+        });
+        let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
+        ends_as_counted(&outcome, lost);
+    }
 }
 
 #[test]

@@ -62,6 +62,15 @@ fn what_is_no_command_line() {
     ] {
         refused(&env, arguments, 2, "usage", &[word]);
     }
+    for (arguments, flag) in [
+        (&["--json", "echo", "front/scan", "--csv"], "--csv"),
+        (&["--json", "probe", "/dev/null", "--toml"], "--toml"),
+    ] {
+        let outcome = env.run(arguments);
+        let error = &outcome.of_class("error")[0];
+        let message = format!("the argument '{flag}' cannot be used with '--json'");
+        assert_eq!((outcome.code, error["message"].as_str()), (Some(2), Some(&*message)), "{outcome}");
+    }
     let help = env.run(&["--help"]);
     assert_eq!((help.code, help.errors.as_str()), (Some(0), ""));
 }
@@ -271,12 +280,15 @@ fn no_such_sensor_or_hub() {
 #[test]
 fn a_disk_that_is_full_is_told() {
     let env = TestEnv::new();
+    let beams = ["1.50"; 181].join(" ");
+    let log = env.file("a.log", format!("FLASER 181 {beams} 0 0 0 0 0 0 1000.0 host 1000.0\n"));
     for verb in [
         &["config", "default"][..],
         &["config", "show", "--no-system-config", "--link=front=/dev/x"],
         &["completions", "bash"],
         &["man"],
         &["doctor", "--no-system-config", "/dev/null"],
+        &["replay", "--no-system-config", "--rate", "max", &log],
     ] {
         let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");
         let mut command = env.command(verb);

@@ -30,7 +30,7 @@ mod topics;
 
 pub use control::{CommandSender, ControlQueue, Outcome};
 pub use player::{PlaybackOptions, PlaybackRate, Player, Progress};
-pub use process::explain_bus_error;
+pub use process::{explain_bus_error, is_hangup_ignored};
 pub use reconnect::LiveLink;
 pub use reload::{ConfigLoader, Reload};
 pub use replay::{RecordedAngle, RecordedMount};
