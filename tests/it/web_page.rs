@@ -4,17 +4,20 @@ use std::path::Path;
 
 use crate::browser::{Browser, Look};
 use crate::recorded_world::recorded_world;
-use crate::testkit::{INT, KILL, Program, TestEnv, skip, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, skip, until};
 use scanhub_sim::world::World;
 
-/// A hall with a reflector, and a post that is put beside the robot when its background is learned.
+/// A hall with a reflector.
 const WORLD: &str =
     "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
-[[thing]]\nradius_mm = 60\npose = [0, 450]\nfrom_s = 9\n
 [[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
 
-fn sensor(env: &TestEnv) -> Program {
-    let world = format!("--world={}", env.file("world", WORLD));
+/// A post beside the robot.
+const POST: &str = "\n[[thing]]\nradius_mm = 60\npose = [0, 450]\n";
+
+/// A scanner in the hall, and with `more` in it.
+fn sensor(env: &TestEnv, more: &str) -> Program {
+    let world = format!("--world={}", env.file("world", format!("{WORLD}{more}")));
     env.simulator(&["front"], &["--seed=71", "--baud=500000", &world])
 }
 
@@ -65,13 +68,17 @@ fn it_shows_what_comes_and_says_why_nothing_does() {
     // One that does not answer yet says where it is looked for, and what looks into that.
     let hub = env.hub(&[env.link("front")]);
     page.await_true("/^front: ./.test(scanhub.reason)");
-    let _sensor = sensor(&env);
+    let empty_hall = sensor(&env, "");
     page.await_true("scanhub.reason === null && scanhub.verdict === 'clear' && scanhub.beams > 100");
     page.await_true(&format!("scanhub.verdict === 'clear' && {COLOUR} !== {red}"));
     page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 0");
     page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
 
     // The post is new, and nearer than the robot may be.
+    let learned = env.path("state/scanhub").join(env.place().name()).join("front.background.json");
+    until("the background is learned", || learned.exists());
+    assert_eq!(empty_hall.end(TERM).code, Some(0));
+    let _with_post = sensor(&env, POST);
     page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
     page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
     page.await_true(&format!("scanhub.verdict === 'stop' && {COLOUR} === {red}"));
@@ -144,7 +151,7 @@ fn page_drops_sensors_of_previous_server() {
 fn keys_and_the_mouse_change_the_picture() {
     let env = TestEnv::new();
     let Some(mut page) = browse(&env, Look::PHONE) else { return };
-    let _sensor = sensor(&env);
+    let _sensor = sensor(&env, POST);
     let _hub = env.hub(&[env.link("front")]);
     let (_server, url) = web(&env, "127.0.0.1:0");
     page.open(&url);

@@ -382,7 +382,11 @@ impl<'a> Following<'a> {
         let Some(domain) = self.session.domain().filter(|_| !self.of_all_sensors.is_empty()) else {
             return Ok(());
         };
-        let Some(called) = self.discovery.call(domain, Instant::now())? else { return Ok(()) };
+        let called = match self.discovery.call(domain, Instant::now()) {
+            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => return Ok(()),
+            called => called?,
+        };
+        let Some(called) = called else { return Ok(()) };
         for sensor in &called.sensors {
             for &topic in self.of_all_sensors.iter().filter(|topic| called.may_have(sensor, **topic)) {
                 let name = TopicName { sensor: sensor.clone(), topic };
@@ -558,7 +562,11 @@ impl<'a> Following<'a> {
         // A hub that starts after a listener creates its topics first.
         let lives = self.session.hub_lives();
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
-        let published = self.session.domain().map(scanhub_shm::published).transpose()?.unwrap_or_default();
+        let published = match self.session.domain().map(scanhub_shm::published).transpose() {
+            // Since the pause after the last shortage, the run has not tried to subscribe again.
+            Err(failure) if failure.kind == Kind::Short && self.despite_shortage => return Ok(()),
+            published => published?.unwrap_or_default(),
+        };
         let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
         sensors.dedup();
         let wants_all = topics.iter().all(|topic| topic.name.is_robot());
