@@ -13,7 +13,7 @@ use scanhub_schema::{
     Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Motion, Pose, Scan, ScanHead,
 };
 
-use fixed::{Multi, Paper};
+use fixed::{BLOCK, Multi, Paper};
 use moving::Moving;
 
 use crate::velocity::Velocity;
@@ -172,8 +172,9 @@ pub struct Model {
     frozen: bool,
     /// Whether nothing has been learned or loaded since the last reset.
     fresh: bool,
+    /// Classes of the beams of the last scan, in whole blocks.
     classes: Box<[Class]>,
-    /// Readings of the beams, while a scan is processed.
+    /// Readings of the beams in whole blocks, while a scan is processed.
     readings: Box<[u16]>,
 }
 
@@ -202,8 +203,8 @@ impl Model {
             generation: 0,
             frozen: false,
             fresh: true,
-            classes: vec![Class::Invalid; beams].into(),
-            readings: vec![INVALID; beams].into(),
+            classes: vec![Class::Invalid; beams.next_multiple_of(BLOCK)].into(),
+            readings: vec![INVALID; beams.next_multiple_of(BLOCK)].into(),
         }
     }
 
@@ -216,12 +217,17 @@ impl Model {
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
         let count = scan.beams().min(self.most);
+        let whole = count.next_multiple_of(BLOCK);
         measure(scan, self.limits.no_return_is_far, &mut self.readings[..count]);
+        self.readings[count..whole].fill(INVALID);
         let (readings, classes) = (&self.readings[..count], &mut self.classes[..count]);
         let learn = !self.frozen;
         match &mut self.learner {
             Learner::Paper(paper) => paper.update(readings, &self.limits, learn, classes),
-            Learner::Multi(multi) => multi.update(readings, &self.limits, learn, classes),
+            Learner::Multi(multi) => {
+                let (readings, classes) = (&self.readings[..whole], &mut self.classes[..whole]);
+                multi.update(readings, &self.limits, learn, classes);
+            }
             Learner::Moving(moving) => moving.update(scan, readings, &self.limits, learn, classes),
         }
         if learn && self.fresh {

@@ -1,9 +1,8 @@
 //! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one
 //! range per beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The loops of [`Multi`]
-//! are not inlined into one function, where they would execute more instructions on more code lines. Its constants were
-//! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`]
+//! were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::{Class, INVALID, Limits, Runs, position};
 use scanhub_schema::Background;
@@ -83,23 +82,33 @@ impl Paper {
 /// learned. [`Runs`] decides how many neighboring beams make an object.
 #[derive(Clone)]
 pub(super) struct Multi {
-    slots: [Slots; SLOTS],
-    /// Weight that the next surface of the beam gains: more if previous scans had no return.
-    gain: Box<[i16]>,
+    blocks: Box<[Block]>,
     runs: Runs,
-    /// The nearest background of each beam, and the weight that its surface gains, while a scan is processed.
+    /// The nearest background of each beam, while a scan is processed.
     nearest: Box<[u16]>,
-    gains: Box<[i16]>,
 }
 
-/// A surface of each beam, if it has one.
+/// Surfaces of neighboring beams.
+///
+/// In a room where nothing moves, all beams of most blocks meet the same surface scan after scan, which is fully known.
+/// Such a scan changes only its range, so the block takes a short path with the same result.
+#[derive(Clone)]
+struct Block {
+    slots: [Slots; SLOTS],
+    /// Weight that the next surface of the beam gains: more if previous scans had no return.
+    gain: [i16; BLOCK],
+    /// Ranges of the surfaces, if each beam has one only, which is fully known. The slots then have older ranges.
+    settled: Option<[u16; BLOCK]>,
+}
+
+/// A surface of each beam of a block, if it has one.
 #[derive(Clone)]
 struct Slots {
     /// In device units.
-    range: Box<[u16]>,
+    range: [u16; BLOCK],
     /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others.
     /// [`NONE`]: there is no surface.
-    weight: Box<[i16]>,
+    weight: [i16; BLOCK],
 }
 
 /// Limits of the steps, as numbers that compare like signed ranges and weights.
@@ -115,30 +124,30 @@ struct Bounds {
 impl Multi {
     /// Creates the state for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Multi {
-        let all = |value: u16| vec![value; beams].into_boxed_slice();
+        let blocks = beams.div_ceil(BLOCK);
         Multi {
-            slots: std::array::from_fn(|_| Slots { range: all(0), weight: vec![NONE; beams].into() }),
-            gain: vec![MET; beams].into(),
+            blocks: vec![Block::NEW; blocks].into(),
             runs: Runs::new(beams),
-            nearest: all(INVALID),
-            gains: vec![MET; beams].into(),
+            nearest: vec![INVALID; blocks * BLOCK].into(),
         }
     }
 
     /// Restores the initial state.
     pub(super) fn forget(&mut self) {
-        self.slots.iter_mut().for_each(|slots| {
-            slots.range.fill(0);
-            slots.weight.fill(NONE);
-        });
-        self.gain.fill(MET);
+        self.blocks.fill(Block::NEW);
         self.runs.forget();
     }
 
-    /// Compares all beams with the state before this scan, then learns from them.
+    /// Compares all beams with the state before this scan, then learns from them. `readings` and `classes` have whole
+    /// blocks.
     pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
         let bounds = Bounds::of(limits);
-        self.compare(readings, bounds, classes);
+        let (read, _) = readings.as_chunks::<BLOCK>();
+        let nearest = &mut self.nearest[..readings.len()];
+        let results = classes.as_chunks_mut::<BLOCK>().0.iter_mut().zip(nearest.as_chunks_mut::<BLOCK>().0);
+        for ((block, readings), (classes, nearest)) in self.blocks.iter_mut().zip(read).zip(results) {
+            block.compare(readings, bounds, classes, nearest);
+        }
         let nearest = &self.nearest[..readings.len()];
         let mut left = 0;
         while let Some(unknown) = position(nearest, left, |range| range == INVALID) {
@@ -150,31 +159,7 @@ impl Multi {
         }
         self.runs.keep(readings, limits, classes);
         if learn {
-            self.learn(readings, bounds);
-        }
-    }
-
-    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
-    /// is none.
-    #[inline(never)]
-    fn compare(&mut self, readings: &[u16], bounds: Bounds, classes: &mut [Class]) {
-        let n = readings.len();
-        // All slices have one length, so the loop needs no bounds checks.
-        let slots = self.slots.each_ref().map(|slots| (&slots.range[..n], &slots.weight[..n]));
-        let (classes, nearest) = (&mut classes[..n], &mut self.nearest[..n]);
-        for (i, ((&reading, class), nearest)) in readings.iter().zip(classes).zip(nearest).enumerate() {
-            let (mut ends, mut known, mut range) = (false, false, Background::FAR);
-            for (ranges, weights) in &slots {
-                let is_known = weights[i] >= bounds.known;
-                known |= is_known;
-                ends |= is_known & (signed(ranges[i].abs_diff(reading)) <= bounds.threshold);
-                range = if is_known & (ranges[i] < range) { ranges[i] } else { range };
-            }
-            *nearest = if known { range } else { INVALID };
-            let aside = if reading < range { Class::Foreground } else { Class::Behind };
-            let with_background = if ends { Class::Background } else { aside };
-            let valid = if known { with_background } else { Class::Unknown };
-            *class = if reading == INVALID { Class::Invalid } else { valid };
+            self.blocks.iter_mut().zip(read).for_each(|(block, readings)| block.learn(readings, bounds));
         }
     }
 
@@ -192,64 +177,195 @@ impl Multi {
         let limit = self.nearest[right].min(self.nearest[left]).saturating_sub(limits.threshold);
         for i in left.saturating_sub(ASIDE).max(right + 1)..left.min(right + ASIDE + 1) {
             let reading = readings[i];
-            let met = |slots: &Slots| {
-                slots.weight[i] >= bounds.replaced
-                    && signed(slots.range[i].abs_diff(reading)) <= bounds.threshold
+            let met = |(range, weight): (u16, i16)| {
+                weight >= bounds.replaced && signed(range.abs_diff(reading)) <= bounds.threshold
             };
-            if reading < limit && reading != INVALID && !self.slots.iter().any(met) {
+            if reading < limit && reading != INVALID && !self.surfaces(i).any(met) {
                 classes[i] = Class::Foreground;
             }
+        }
+    }
+
+    /// Returns range and weight of each surface of beam `i`, whose block is not settled.
+    fn surfaces(&self, i: usize) -> impl Iterator<Item = (u16, i16)> {
+        let beam = i % BLOCK;
+        self.blocks[i / BLOCK].slots.iter().map(move |slots| (slots.range[beam], slots.weight[beam]))
+    }
+
+    /// Uses `range` as the only background of beam `i`, as well known as possible.
+    pub(super) fn adopt(&mut self, i: usize, range: u16) {
+        let (block, beam) = (&mut self.blocks[i / BLOCK], i % BLOCK);
+        block.unsettle();
+        block.slots.iter_mut().for_each(|slots| slots.weight[beam] = NONE);
+        block.slots[0].range[beam] = range;
+        block.slots[0].weight[beam] = i16::MAX;
+    }
+
+    /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
+    /// no return, however frequent: a model that starts with that range alone would report the surface as foreground.
+    pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
+        if let Some(ranges) = &self.blocks[i / BLOCK].settled {
+            return ranges[i % BLOCK];
+        }
+        let known = |&(_, weight): &(u16, i16)| weight >= Bounds::of(limits).known;
+        let rank = |&(range, weight): &(u16, i16)| (range != Background::FAR, weight, u16::MAX - range);
+        let best = self.surfaces(i).filter(known).max_by_key(rank);
+        best.map_or(Background::UNTAUGHT, |(range, _)| range)
+    }
+}
+
+impl Block {
+    const NEW: Block = Block {
+        slots: [const { Slots { range: [0; BLOCK], weight: [NONE; BLOCK] } }; SLOTS],
+        gain: [MET; BLOCK],
+        settled: None,
+    };
+
+    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there
+    /// is none.
+    #[inline]
+    fn compare(
+        &mut self,
+        readings: &[u16; BLOCK],
+        bounds: Bounds,
+        classes: &mut [Class; BLOCK],
+        nearest: &mut [u16; BLOCK],
+    ) {
+        match &self.settled {
+            Some(ranges) if meets(ranges, readings, bounds) => {
+                *nearest = *ranges;
+                for (class, &reading) in classes.iter_mut().zip(readings) {
+                    *class = if reading == INVALID { Class::Invalid } else { Class::Background };
+                }
+            }
+            _ => {
+                self.unsettle();
+                self.compare_all(readings, bounds, classes, nearest);
+            }
+        }
+    }
+
+    /// Writes the ranges of a settled block into the slots, because a beam has a reading of something else.
+    fn unsettle(&mut self) {
+        if let Some(ranges) = self.settled.take() {
+            for slots in &mut self.slots {
+                for ((range, weight), new) in slots.range.iter_mut().zip(slots.weight).zip(ranges) {
+                    *range = if weight == NONE { *range } else { new };
+                }
+            }
+        }
+    }
+
+    /// Compares with all surfaces.
+    #[inline]
+    fn compare_all(
+        &self,
+        readings: &[u16; BLOCK],
+        bounds: Bounds,
+        classes: &mut [Class; BLOCK],
+        nearest: &mut [u16; BLOCK],
+    ) {
+        for (i, &reading) in readings.iter().enumerate() {
+            let (mut ends, mut known, mut range) = (false, false, Background::FAR);
+            for slots in &self.slots {
+                let is_known = slots.weight[i] >= bounds.known;
+                known |= is_known;
+                ends |= is_known & (signed(slots.range[i].abs_diff(reading)) <= bounds.threshold);
+                range = if is_known & (slots.range[i] < range) { slots.range[i] } else { range };
+            }
+            nearest[i] = if known { range } else { INVALID };
+            let aside = if reading < range { Class::Foreground } else { Class::Behind };
+            let with_background = if ends { Class::Background } else { aside };
+            let valid = if known { with_background } else { Class::Unknown };
+            classes[i] = if reading == INVALID { Class::Invalid } else { valid };
         }
     }
 
     /// Updates the surfaces. The one nearest to a reading, within the threshold, was met. The others lose weight: those
     /// that the beam passed through more than those that may be hidden. A reading of no surface replaces the least
     /// known one, unless all are known too well.
-    #[inline(never)]
-    fn learn(&mut self, readings: &[u16], bounds: Bounds) {
-        self.gain(readings, bounds);
-        let n = readings.len();
-        let gains = &self.gains[..n];
-        let mut slots = self.slots.each_mut().map(|slots| (&mut slots.range[..n], &mut slots.weight[..n]));
+    #[inline]
+    fn learn(&mut self, readings: &[u16; BLOCK], bounds: Bounds) {
+        match &mut self.settled {
+            Some(ranges) => {
+                let (readings, mut drawn) = (*readings, *ranges);
+                for (range, reading) in drawn.iter_mut().zip(readings) {
+                    *range = range.wrapping_add_signed(step(*range, reading) & mask(reading != INVALID));
+                }
+                *ranges = drawn;
+                self.gain(readings, bounds);
+            }
+            None => self.learn_all(readings, bounds),
+        }
+    }
+
+    /// Updates all surfaces.
+    #[inline]
+    fn learn_all(&mut self, readings: &[u16; BLOCK], bounds: Bounds) {
+        let gains = self.gain(*readings, bounds);
         for (i, &reading) in readings.iter().enumerate() {
-            let range = slots.each_ref().map(|(ranges, _)| ranges[i]);
-            let weight = slots.each_ref().map(|(_, weights)| weights[i]);
-            let (new_range, new_weight) = learned(range, weight, reading, gains[i], bounds);
-            for (k, (ranges, weights)) in slots.iter_mut().enumerate() {
-                ranges[i] = new_range[k];
-                weights[i] = new_weight[k];
+            let range = self.slots.each_ref().map(|slots| slots.range[i]);
+            let weight = self.slots.each_ref().map(|slots| slots.weight[i]);
+            let (range, weight) = learned(range, weight, reading, gains[i], bounds);
+            for (k, slots) in self.slots.iter_mut().enumerate() {
+                slots.range[i] = range[k];
+                slots.weight[i] = weight[k];
             }
         }
+        self.settled = self.single_surfaces(bounds.full);
     }
 
-    /// Computes the weights that the surfaces gain in this scan. A separate loop, because the processor does not do all
-    /// of this at once in the loop over the surfaces.
-    #[inline(never)]
-    fn gain(&mut self, readings: &[u16], bounds: Bounds) {
-        for ((gain, next), &reading) in self.gains.iter_mut().zip(&mut self.gain).zip(readings) {
-            let is_far = reading == Background::FAR;
-            *gain = if is_far { MET } else { *next };
-            let more = (*next + MET).min(bounds.returned);
-            let after = if is_far { more } else { MET };
-            *next = if reading == INVALID { *next } else { after };
+    /// Returns the ranges of the surfaces if each beam has one only, of weight `full`.
+    #[inline]
+    fn single_surfaces(&self, full: i16) -> Option<[u16; BLOCK]> {
+        let (mut ranges, mut known, mut empty) = ([0; BLOCK], [0; BLOCK], [0; BLOCK]);
+        for slots in &self.slots {
+            for i in 0..BLOCK {
+                let is_full = mask(slots.weight[i] == full);
+                ranges[i] |= slots.range[i] & is_full as u16;
+                known[i] += is_full;
+                empty[i] += mask(slots.weight[i] == NONE);
+            }
         }
+        (known == [-1; BLOCK] && empty == [1 - SLOTS as i16; BLOCK]).then_some(ranges)
     }
 
-    /// Uses `range` as the only background of beam `i`, as well known as possible.
-    pub(super) fn adopt(&mut self, i: usize, range: u16) {
-        self.slots.iter_mut().for_each(|slots| slots.weight[i] = NONE);
-        self.slots[0].range[i] = range;
-        self.slots[0].weight[i] = i16::MAX;
+    /// Returns the weights that the surfaces gain in this scan.
+    #[inline]
+    fn gain(&mut self, readings: [u16; BLOCK], bounds: Bounds) -> [i16; BLOCK] {
+        let (mut gains, mut next_gains) = (self.gain, self.gain);
+        for ((gain, next), reading) in gains.iter_mut().zip(&mut next_gains).zip(readings) {
+            let (far, valid) = (mask(reading == Background::FAR), mask(reading != INVALID));
+            let after = ((*next + MET).min(bounds.returned) & far) | (MET & !far);
+            *gain = (MET & far) | (*next & !far);
+            *next = (after & valid) | (*next & !valid);
+        }
+        self.gain = next_gains;
+        gains
     }
+}
 
-    /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
-    /// no return, however frequent: a model that starts with that range alone would report the surface as foreground.
-    pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
-        let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
-        let rank = |s: &&Slots| (s.range[i] != Background::FAR, s.weight[i], u16::MAX - s.range[i]);
-        let best = self.slots.iter().filter(known).max_by_key(rank);
-        best.map_or(Background::UNTAUGHT, |slots| slots.range[i])
-    }
+/// Returns whether each beam meets its surface at `range`, or has no reading.
+#[inline]
+fn meets(range: &[u16; BLOCK], readings: &[u16; BLOCK], bounds: Bounds) -> bool {
+    let beams = range.iter().zip(readings);
+    beams.fold(true, |all, (&range, &reading)| {
+        all & ((signed(range.abs_diff(reading)) <= bounds.threshold) | (reading == INVALID))
+    })
+}
+
+/// Returns the change of the `range` of a surface after a `reading` that met it: their difference divided by 16 and
+/// rounded to zero. Shifts stay 16 bits wide, which a division does not.
+#[inline]
+fn step(range: u16, reading: u16) -> i16 {
+    let apart = reading.wrapping_sub(range) as i16;
+    apart.wrapping_add((apart >> 15) & ((1 << DRAWN) - 1)) >> DRAWN
+}
+
+/// Returns -1, which has all bits, or 0. An `if` in a short loop would become a branch for each beam.
+#[inline]
+fn mask(is_set: bool) -> i16 {
+    -i16::from(is_set)
 }
 
 /// Returns the surfaces of one beam after `reading`. The one that was met gains this weight.
@@ -276,8 +392,7 @@ fn learned(
     for k in 0..SLOTS {
         let met = open & (apart[k] == least_apart);
         open &= !met;
-        let step = (reading.wrapping_sub(range[k]) as i16) / DRAWN;
-        new_range[k] = range[k].wrapping_add_signed(if met { step } else { 0 });
+        new_range[k] = range[k].wrapping_add_signed(if met { step(range[k], reading) } else { 0 });
         let leak = if signed(reading) > signed(range[k]) { -PASSED } else { -HIDDEN };
         let change = if met { gain } else { leak };
         let change = if valid { change } else { 0 };
@@ -314,9 +429,11 @@ impl Bounds {
 
 /// Number of surfaces per beam: two at an edge, and one that may replace either.
 const SLOTS: usize = 3;
-/// Divisor of the distance between a surface and a reading by which the surface moves, in whole units. Too slow to
-/// follow a person who walks.
-const DRAWN: i16 = 16;
+/// Number of beams of a [`Block`]: the 16-bit numbers that the processor computes at once.
+pub(super) const BLOCK: usize = 8;
+/// Share of the distance between a surface and a reading by which the surface moves, in whole units: 1/16, as a number
+/// of bits. Too slow to follow a person who walks.
+const DRAWN: u32 = 4;
 
 /// Weight of a surface that does not exist.
 const NONE: i16 = i16::MIN;
@@ -341,3 +458,57 @@ const KNOWN: u16 = 5;
 const REPLACED: u16 = 2;
 /// Number of beams on either side among which one must be known, to replace an unknown one.
 const ASIDE: usize = 8;
+
+#[cfg(test)]
+mod tests {
+    use super::super::{ScanHead, Settings};
+    use super::*;
+
+    /// Beams of two blocks and a part of one, which have one surface each, or a window.
+    const BEAMS: usize = 19;
+
+    #[test]
+    fn the_short_path_of_a_settled_block_changes_nothing() {
+        let mut random = fastrand::Rng::with_seed(1);
+        let limits =
+            Limits { scans: 300, ..Limits::of(&Settings::default(), &ScanHead::lms(BEAMS, 0, 500, 1, 13)) };
+        let [mut short, mut long] = [Multi::new(BEAMS), Multi::new(BEAMS)];
+        let mut settled = 0;
+        for number in 0..6_000 {
+            let noise = if number % 500 == 0 { 60 } else { 20 };
+            let mut readings = [INVALID; 3 * BLOCK];
+            for (i, reading) in readings[..BEAMS].iter_mut().enumerate() {
+                *reading = match random.u16(..10_000) {
+                    0..100 => INVALID,
+                    100..110 => Background::FAR,
+                    // Beams of windows seldom return.
+                    110..9_990 if i % 5 == 0 => Background::FAR,
+                    _ => 1_000 + 10 * i as u16 + random.u16(..noise),
+                };
+            }
+            if number % 1_000 == 0 {
+                // A model is loaded, so the windows are known before the gains of their beams have grown.
+                for multi in [&mut short, &mut long] {
+                    multi.forget();
+                    let valid = readings.iter().enumerate().filter(|&(_, &reading)| reading != INVALID);
+                    valid.for_each(|(i, &reading)| multi.adopt(i, reading));
+                }
+            }
+            let [mut short_classes, mut long_classes] = [[Class::Invalid; 3 * BLOCK]; 2];
+            long.blocks.iter_mut().for_each(|block| block.unsettle());
+            short.update(&readings, &limits, true, &mut short_classes);
+            long.update(&readings, &limits, true, &mut long_classes);
+            assert_eq!(short_classes, long_classes, "scan {number}");
+            settled += short.blocks.iter().filter(|block| block.settled.is_some()).count();
+            let state = |multi: &Multi| {
+                let mut multi = multi.clone();
+                multi.blocks.iter_mut().for_each(|block| block.unsettle());
+                let all = multi.blocks.iter().flat_map(|block| block.slots.clone());
+                let gains = multi.blocks.iter().flat_map(|block| block.gain);
+                (all.map(|slots| (slots.range, slots.weight)).collect::<Vec<_>>(), gains.collect::<Vec<_>>())
+            };
+            assert_eq!(state(&short), state(&long), "scan {number}");
+        }
+        assert!((1_000..11_000).contains(&settled), "{settled} blocks were settled");
+    }
+}
