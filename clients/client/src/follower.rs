@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::time::{Duration, Instant};
 
 use scanhub_schema::{Failure, Flags, Header, Kind, Scan};
-use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber};
+use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
 
 use crate::session::Session;
 
@@ -13,7 +13,7 @@ use crate::session::Session;
 /// during a wait.
 #[derive(Debug)]
 pub struct Received<P: Payload + ?Sized> {
-    sample: Sample<P>,
+    sample: Sample<P, ThreadSafeService>,
     /// Samples of this topic that were sent before this one and not received.
     pub missed: u64,
     /// The hub was restarted since the last sample: its numbers start again at 0.
@@ -46,7 +46,7 @@ impl Received<Scan> {
 /// Follows one topic, also across restarts of the hub.
 pub struct Follower<P: Payload + ?Sized> {
     sensor: String,
-    port: Option<(u32, Subscriber<P>)>,
+    port: Option<(u32, Subscriber<P, ThreadSafeService>)>,
     asked_at: Option<Instant>,
     numbers: Numbers,
     unconnected_since: Option<Instant>,
@@ -135,7 +135,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         Ok(true)
     }
 
-    fn account(&mut self, sample: Sample<P>) -> Received<P> {
+    fn account(&mut self, sample: Sample<P, ThreadSafeService>) -> Received<P> {
         let Noted { missed, restarted } = self.numbers.note(sample.user_header());
         Received { sample, missed, restarted }
     }

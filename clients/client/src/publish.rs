@@ -2,9 +2,8 @@
 //! topics of a hub: by name, in every language, with a count of missed samples, and without polling. A name has one
 //! publisher, which holds a lock while it runs.
 
-use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
-use std::rc::{Rc, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{
@@ -12,11 +11,14 @@ use scanhub_schema::{
 };
 use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use scanhub_shm::{
-    DEFAULT_DOMAIN, Domain, DueRings, Environment, ListenLock, NameLock, Node, Payload, TopicPublisher,
-    Waker, holder, name_held, publisher_domain,
+    DEFAULT_DOMAIN, Domain, DueRings, Environment, ListenLock, NameLock, Payload, Role, SharedMemory,
+    ThreadSafeService, TopicPublisher, holder, name_held, publisher_domain,
 };
 
 use crate::clock;
+
+type Node = scanhub_shm::Node<ThreadSafeService>;
+type Waker = scanhub_shm::Waker<ThreadSafeService>;
 
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs follow it by
 /// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
@@ -65,14 +67,14 @@ pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
 
 /// Membership of a publishing process in a domain. It ends when the session and every publisher created from it are
 /// dropped.
-pub struct PublishSession(Rc<Membership>);
+pub struct PublishSession(Arc<Membership>);
 
 struct Membership {
     domain: Domain,
     limits: TopicLimits,
     boot: u64,
     /// Wakers by name. A second waker of the same name would disconnect the subscribers of the first one when it ends.
-    sensors: RefCell<Vec<Weak<Awakener>>>,
+    sensors: Mutex<Vec<Weak<Awakener>>>,
     node: Node,
     // After the node, so that the next holder of the lock finds no node of this process.
     lock: Place,
@@ -109,7 +111,7 @@ impl PublishSession {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, scanhub_shm::hub_node(domain)?, lock))
+        Ok(PublishSession::with(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock))
     }
 
     /// Publishes as `name`. A hub or a listener may run in the same domain. Use it for results that a program computes
@@ -141,14 +143,14 @@ impl PublishSession {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
         }
-        PublishSession::with(domain, limits, scanhub_shm::hub_node(domain)?, lock).sensor(name)
+        PublishSession::with(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock).sensor(name)
     }
 
     fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
-        let (domain, sensors) = (domain.clone(), RefCell::default());
-        PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, lock }))
+        let (domain, sensors) = (domain.clone(), Mutex::default());
+        PublishSession(Arc::new(Membership { domain, limits, boot, sensors, node, lock }))
     }
 
     /// Returns the limits of the session's topics.
@@ -182,16 +184,16 @@ impl PublishSession {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
-        let mut sensors = self.0.sensors.borrow_mut();
+        let mut sensors = locked(&self.0.sensors);
         sensors.retain(|sensor| sensor.strong_count() > 0);
         if let Some(known) = sensors.iter().filter_map(Weak::upgrade).find(|known| known.name == name) {
             return Ok(SensorPublisher(known));
         }
         self.check_room(&[])?;
         let waker = Waker::new(&self.0.node, name)?;
-        let (name, due) = (name.to_owned(), Cell::default());
-        let sensor = Rc::new(Awakener { name, waker, due, membership: self.0.clone() });
-        sensors.push(Rc::downgrade(&sensor));
+        let (name, due) = (name.to_owned(), Mutex::default());
+        let sensor = Arc::new(Awakener { name, waker, due, membership: self.0.clone() });
+        sensors.push(Arc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
     }
 
@@ -202,14 +204,14 @@ impl PublishSession {
 }
 
 /// The topics of one name. They share the waker of their subscribers.
-pub struct SensorPublisher(Rc<Awakener>);
+pub struct SensorPublisher(Arc<Awakener>);
 
 struct Awakener {
     name: String,
     waker: Waker,
     /// Rings of the samples that were sent since the last [`SensorPublisher::wake`].
-    due: Cell<DueRings>,
-    membership: Rc<Membership>,
+    due: Mutex<DueRings>,
+    membership: Arc<Membership>,
 }
 
 impl SensorPublisher {
@@ -261,23 +263,21 @@ impl SensorPublisher {
     ///
     /// [`Kind::Failed`](scanhub_schema::Kind) if some were not woken; these look by themselves ten times a second.
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
-        let mut due = self.0.due.take();
+        let mut due = std::mem::take(&mut *locked(&self.0.due));
         Ring::ALL.into_iter().filter(|&ring| due.take(ring)).for_each(|ring| self.0.waker.ring(ring));
         self.0.waker.tell(why)
     }
 
     /// Notes that `reached` subscribers have received a sample of `topic`.
     fn note(&self, topic: Topic, reached: usize) {
-        let mut due = self.0.due.get();
-        due.note(topic, reached);
-        self.0.due.set(due);
+        locked(&self.0.due).note(topic, reached);
     }
 }
 
 /// Publisher of one topic. It fills in headers and sequence numbers, and wakes the subscribers.
 pub struct Publication<P: Payload + ?Sized> {
     // Dropped before the waker and the session.
-    topic: TopicPublisher<P>,
+    topic: TopicPublisher<P, SharedMemory<P, ThreadSafeService>>,
     sensor: SensorPublisher,
 }
 
@@ -295,7 +295,10 @@ impl<P: Payload + ?Sized> Publication<P> {
         PublishSession::beside(domain, name, &topics, limits)?.topic()
     }
 
-    fn new(topic: TopicPublisher<P>, sensor: SensorPublisher) -> Publication<P> {
+    fn new(
+        topic: TopicPublisher<P, SharedMemory<P, ThreadSafeService>>,
+        sensor: SensorPublisher,
+    ) -> Publication<P> {
         Publication { topic, sensor }
     }
 
@@ -440,4 +443,9 @@ impl Publication<[u8]> {
     pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }
+}
+
+/// Locks `mutex`. A thread that panicked while it held the lock has left a valid value.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

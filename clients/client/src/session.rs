@@ -10,7 +10,7 @@ use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
 use scanhub_schema::{Failure, Kind, Topic};
-use scanhub_shm::{Domain, Node, Payload, Subscriber, holder, is_starting};
+use scanhub_shm::{Domain, Node, Payload, Role, Subscriber, ThreadSafeService, holder, is_starting};
 
 use crate::presence::{Change, Presence, Who};
 use crate::wait::{Wait, Wakeups};
@@ -37,7 +37,7 @@ pub struct Session {
 struct Joined {
     domain: Domain,
     wakeups: Wakeups,
-    node: Node,
+    node: Node<ThreadSafeService>,
 }
 
 impl Session {
@@ -88,7 +88,7 @@ impl Session {
         let is_member = |joined: &Joined| scanhub_shm::is_member(&joined.node, domain.root());
         match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
             Some(true) => {}
-            _ => match scanhub_shm::client_node(domain) {
+            _ => match scanhub_shm::join(domain, Role::Subscriber) {
                 Ok(node) => {
                     let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
                     self.joined = Some(Joined { domain, wakeups, node });
@@ -145,7 +145,10 @@ impl Session {
     ///
     /// [`Kind::Short`] if memory, descriptors or places for subscribers are short; [`Kind::Failed`] if the topic has
     /// another layout.
-    pub fn subscribe<P: Payload + ?Sized>(&mut self, sensor: &str) -> Result<Option<Subscriber<P>>, Failure> {
+    pub fn subscribe<P: Payload + ?Sized>(
+        &mut self,
+        sensor: &str,
+    ) -> Result<Option<Subscriber<P, ThreadSafeService>>, Failure> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
         };

@@ -4,9 +4,12 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use scanhub_schema::{Failure, Ring, Topic};
-use scanhub_shm::{Bell, Listener, Node, Unsupported};
+use scanhub_shm::{Bell, ThreadSafeService, Unsupported};
 
 use crate::clock;
+
+type Node = scanhub_shm::Node<ThreadSafeService>;
+type Listener = scanhub_shm::Listener<ThreadSafeService>;
 
 /// Method by which a subscriber waits for samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -238,8 +241,7 @@ const WITHOUT_BELL: Duration = Duration::from_millis(20);
 mod tests {
     use super::*;
     use scanhub_schema::Wake;
-    use scanhub_shm::Domain;
-    use scanhub_shm::Waker;
+    use scanhub_shm::{Domain, Role, Waker};
     use std::path::PathBuf;
     use std::sync::mpsc;
     use std::thread;
@@ -298,7 +300,7 @@ mod tests {
     fn each_topic_is_told_by_its_ring() {
         let place = Place::new("rings");
         let hub = scanhub_shm::hub_node(&place.1).unwrap();
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         let waker = Waker::new(&hub, "front").unwrap();
         for (topics, told) in
             FOLLOWED.into_iter().zip([&[Ring::First][..], &[Ring::Last], &[Ring::First, Ring::Last]])
@@ -333,7 +335,7 @@ mod tests {
         let place = Place::new(name);
         let mut wakeups = Wakeups::by(wait);
         let hubs = ["front", "rear"].map(|sensor| hub(&place.1, sensor));
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         assert!(!wakeups.add(&node, "left", Topic::Zones).unwrap(), "there is no such sensor");
         for (at, sensor) in ["front", "rear"].into_iter().enumerate() {
             topics.iter().for_each(|&topic| assert!(wakeups.add(&node, sensor, topic).unwrap()));
@@ -353,7 +355,7 @@ mod tests {
     fn the_bell_of_a_hub_that_ended_is_exchanged() {
         let place = Place::new("ended");
         let hub = scanhub_shm::hub_node(&place.1).unwrap();
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         let mut wakeups = Wakeups::by(Wait::Doorbell);
         let first = Waker::new(&hub, "front").unwrap();
         assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
@@ -375,7 +377,7 @@ mod tests {
     fn a_bell_that_somebody_removed_while_there_was_no_hub_is_exchanged() {
         let place = Place::new("removed");
         let hub = scanhub_shm::hub_node(&place.1).unwrap();
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         let mut wakeups = Wakeups::by(Wait::Doorbell);
         // A hub that is killed closes nothing.
         std::mem::forget(Waker::new(&hub, "front").unwrap());
@@ -398,7 +400,7 @@ mod tests {
     fn an_event_that_is_made_later_is_listened_to() {
         let place = Place::new("later");
         let hub = scanhub_shm::hub_node(&place.1).unwrap();
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         let mut wakeups = Wakeups::by(Wait::Doorbell);
         let first = Waker::new(&hub, "front").unwrap();
         assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());
@@ -417,7 +419,7 @@ mod tests {
     fn where_words_cannot_be_waited_for_the_event_wakes() {
         let place = Place::new("turn");
         let hub = scanhub_shm::hub_node(&place.1).unwrap();
-        let node = scanhub_shm::client_node(&place.1).unwrap();
+        let node = scanhub_shm::join(&place.1, Role::Subscriber).unwrap();
         let waker = Waker::new(&hub, "front").unwrap();
         let mut wakeups = Wakeups::by(Wait::Doorbell);
         assert!(wakeups.add(&node, "front", Topic::Zones).unwrap());

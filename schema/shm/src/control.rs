@@ -6,7 +6,7 @@ use std::fmt::Debug;
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::{client, server};
-use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::ipc::Service as LocalService;
 use iceoryx2::prelude::{AllocationStrategy, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
@@ -20,7 +20,7 @@ use crate::wake::{Listener, Notifier, WakeService, create_listener, notifier, op
 
 /// The hub's end. Its listener [`requests`](Self::requests) is woken by each request.
 pub struct ControlServer {
-    server: server::Server<Service, [u8], (), [u8], ()>,
+    server: server::Server<LocalService, [u8], (), [u8], ()>,
     requests: Listener,
     responses: Notifier,
     control: ControlService,
@@ -28,11 +28,11 @@ pub struct ControlServer {
 }
 
 /// A request that has no response yet. If it is dropped, it gets none.
-pub struct Asked(ActiveRequest<Service, [u8], (), [u8], ()>);
+pub struct Asked(ActiveRequest<LocalService, [u8], (), [u8], ()>);
 
 /// A client's end.
 pub struct ControlClient {
-    client: client::Client<Service, [u8], (), [u8], ()>,
+    client: client::Client<LocalService, [u8], (), [u8], ()>,
     requests: Notifier,
     responses: Listener,
     _control: ControlService,
@@ -40,9 +40,9 @@ pub struct ControlClient {
 }
 
 /// A request that was sent. Dropping it cancels the request.
-pub struct Pending(PendingResponse<Service, [u8], (), [u8], ()>);
+pub struct Pending(PendingResponse<LocalService, [u8], (), [u8], ()>);
 
-type ControlService = request_response::PortFactory<Service, [u8], (), [u8], ()>;
+type ControlService = request_response::PortFactory<LocalService, [u8], (), [u8], ()>;
 
 impl ControlServer {
     /// Returns the hub's end of the service, which is created if it does not exist.

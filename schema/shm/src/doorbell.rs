@@ -19,6 +19,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering, fence};
 
+use iceoryx2::service::Service;
 use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
 use rustix::io::Errno;
@@ -43,7 +44,7 @@ impl DoorbellRinger {
     /// one.
     ///
     /// Returns [`Kind::Short`] if there is no memory for it, and [`Kind::Failed`] if another user's file has its name.
-    pub(crate) fn hang(node: &Node, sensor: &str) -> Result<DoorbellRinger, Failure> {
+    pub(crate) fn hang<S: Service>(node: &Node<S>, sensor: &str) -> Result<DoorbellRinger, Failure> {
         let path = path(node, sensor);
         match DoorbellRinger::open(&path) {
             Ok(page) => Ok(DoorbellRinger { page, path }),
@@ -98,7 +99,7 @@ impl Drop for DoorbellRinger {
 /// Counts at the doorbell of `sensor` that this process has attached to one of the sensor's services, so that the hub
 /// sends it the next sample. If the doorbell does not exist or cannot be written, the hub finds the subscriber when it
 /// starts, or after a tenth of a second.
-pub(crate) fn note_attached(node: &Node, sensor: &str) {
+pub(crate) fn note_attached<S: Service>(node: &Node<S>, sensor: &str) {
     let path = path(node, sensor);
     if let Ok(file) = own(OpenOptions::new().read(true).write(true), &path)
         && file.metadata().is_ok_and(|metadata| metadata.len() >= PAGE as u64)
@@ -119,7 +120,7 @@ impl Bell {
     ///
     /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs to another
     /// user.
-    pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
+    pub fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<Bell>, Failure> {
         let path = path(node, sensor);
         let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
             let is_made = file.metadata()?.len() >= PAGE as u64;
@@ -226,7 +227,7 @@ impl Page {
 
 const PAGE: usize = 4096;
 
-fn path(node: &Node, sensor: &str) -> PathBuf {
+fn path<S: Service>(node: &Node<S>, sensor: &str) -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
 }
 

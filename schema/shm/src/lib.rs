@@ -26,12 +26,18 @@ pub use doorbell::{Bell, Unsupported, sleep_at_bells};
 pub use file_in_use::is_unheld;
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
-/// Shared memory between processes. Its ports stay in their thread; nodes and services may move.
-pub use iceoryx2::prelude::ipc::Service;
+/// Shared memory between processes, with ports that stay in their thread; nodes and services may move. The hub uses
+/// it.
+pub use iceoryx2::prelude::ipc::Service as LocalService;
+/// The same shared memory, with ports and samples that may move between threads. They differ from those of
+/// [`LocalService`] only in a lock within the process, so both kinds attach to one topic. Clients use it.
+pub use iceoryx2::prelude::ipc_threadsafe::Service as ThreadSafeService;
 pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
+/// Kind of shared memory: [`LocalService`] or [`ThreadSafeService`].
+pub use iceoryx2::service::Service;
 pub use processes::{
-    Cleaned, HubLock, LIBRARY, ListenLock, NameLock, Node, Nodes, clean, client_node, holder, hub_node,
-    is_member, is_starting, name_held, nodes, publisher, publisher_domain,
+    Cleaned, HubLock, LIBRARY, ListenLock, NameLock, Node, Nodes, Role, clean, client_node, holder, hub_node,
+    is_member, is_starting, join, name_held, nodes, publisher, publisher_domain,
 };
 pub use segments::{Segment, allocate, strangers};
 pub use service::{links, published, sensors, sensors_with_zones};

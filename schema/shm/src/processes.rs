@@ -13,11 +13,12 @@ use std::time::Duration;
 
 use iceoryx2::config::Config;
 use iceoryx2::node::NodeState;
-use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::ipc::Service as LocalService;
 use iceoryx2::prelude::{
     CallbackProgression, FileName, LogLevel, NodeBuilder, SemanticString, SignalHandlingMode,
     set_log_level_from_env_or,
 };
+use iceoryx2::service::Service;
 use rustix::fs::FileType;
 use scanhub_schema::{Failure, Kind};
 
@@ -29,31 +30,45 @@ use crate::segments::{access_failure, ensure_node_counter, ensure_prefix, forget
 pub const LIBRARY: &str = "iceoryx2 0.10.0";
 
 /// Membership of a process in a domain.
-pub type Node = iceoryx2::node::Node<Service>;
+pub type Node<S = LocalService> = iceoryx2::node::Node<S>;
 
-/// Returns the node of a publisher in `domain`, which holds its [`HubLock`](crate::HubLock),
-/// [`ListenLock`](crate::ListenLock) or a [`NameLock`](crate::NameLock). Removes the files that dead publishers and
-/// subscribers left.
+/// Role of a process in a domain.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// It holds a [`HubLock`], [`ListenLock`] or [`NameLock`].
+    Publisher,
+    /// It only follows topics.
+    Subscriber,
+}
+
+/// Joins `domain` as a publisher whose ports stay in their thread, as [`join`] does.
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user.
+/// Returns the errors of [`join`].
 pub fn hub_node(domain: &Domain) -> Result<Node, Failure> {
-    node(domain, true)
+    join(domain, Role::Publisher)
 }
 
-/// Returns the node of a subscriber in `domain`. It removes no files.
+/// Joins `domain` as a subscriber whose ports stay in their thread, as [`join`] does.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`hub_node`], and [`Kind::NoHub`] if the domain has no prefix.
+/// Returns the errors of [`join`].
 pub fn client_node(domain: &Domain) -> Result<Node, Failure> {
-    node(domain, false)
+    join(domain, Role::Subscriber)
 }
 
-fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
+/// Returns the node of this process in `domain`. The node of a publisher removes the files that dead publishers and
+/// subscribers left; that of a subscriber removes none.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] with owner, mode and remedy if the directory belongs to another user. For a subscriber,
+/// returns [`Kind::NoHub`] if the domain has no prefix.
+pub fn join<S: Service>(domain: &Domain, role: Role) -> Result<Node<S>, Failure> {
     set_log_level_from_env_or(LogLevel::Error);
-    let root = domain.root();
+    let (root, cleanup) = (domain.root(), role == Role::Publisher);
     let _making = if cleanup {
         let making = MakingLock::wait(root)?;
         ensure_prefix(root, &making)?;
@@ -81,7 +96,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     NodeBuilder::new()
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .config(&config)
-        .create::<Service>()
+        .create::<S>()
         .map_err(|error| access_failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
@@ -91,7 +106,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
 /// # Errors
 ///
 /// Returns the errors of [`client_node`].
-pub fn is_member(node: &Node, root: &Path) -> Result<bool, Failure> {
+pub fn is_member<S: Service>(node: &Node<S>, root: &Path) -> Result<bool, Failure> {
     let prefix = prefix_of(root)?;
     Ok(prefix.is_some_and(|prefix| node.config().global.prefix.as_bytes() == prefix.as_bytes()))
 }
@@ -118,7 +133,7 @@ pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
 fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
     let mut nodes = Nodes::default();
     let Some(config) = config(root)? else { return Ok(nodes) };
-    let listed = Node::list(&config, |state| {
+    let listed = Node::<LocalService>::list(&config, |state| {
         match state {
             NodeState::Alive(_) => nodes.alive += 1,
             NodeState::Dead(_) => nodes.dead += 1,

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::port::publisher::PublisherCreateError;
 use iceoryx2::prelude::CallbackProgression;
-use iceoryx2::prelude::ipc::Service;
-use iceoryx2::service::Service as _;
+use iceoryx2::prelude::ipc::Service as LocalService;
+use iceoryx2::service::Service;
 use iceoryx2::service::builder::event::EventOpenOrCreateError;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
@@ -106,8 +106,8 @@ pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
 /// Calls `make` until the service exists, for at most two seconds. A service that its last user is leaving can be
 /// created again soon.
 #[expect(clippy::disallowed_methods, reason = "waits for a service that another process has half created")]
-pub(crate) fn create<T>(
-    node: &Node,
+pub(crate) fn create<T, S: Service>(
+    node: &Node<S>,
     service: &ServiceName,
     make: impl Fn() -> Result<T, OpenFailure>,
 ) -> Result<T, Failure> {
@@ -126,8 +126,8 @@ pub(crate) fn create<T>(
 }
 
 /// Returns `None` if the service does not exist, and a failure for any other error.
-pub(crate) fn open<T, E>(
-    node: &Node,
+pub(crate) fn open<T, E, S: Service>(
+    node: &Node<S>,
     service: &ServiceName,
     opened: Result<T, E>,
 ) -> Result<Option<T>, Failure>
@@ -184,7 +184,7 @@ fn sensors_with(domain: &Domain, is_wanted: impl Fn(Topic) -> bool) -> Result<Ve
 pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     let mut topics = Vec::new();
     let Some(config) = config(domain.root())? else { return Ok(topics) };
-    let listed = Service::list(&config, |service| {
+    let listed = LocalService::list(&config, |service| {
         if let Some((sensor, Some(topic))) = of_service(service.static_details.name().as_str()) {
             topics.push((sensor.to_owned(), topic));
         }
@@ -243,7 +243,7 @@ pub(crate) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
     })
 }
 
-fn failure(node: &Node, service: &ServiceName, failed: OpenFailure) -> Failure {
+fn failure<S: Service>(node: &Node<S>, service: &ServiceName, failed: OpenFailure) -> Failure {
     match failed {
         OpenFailure::Full => Failure::new(
             Kind::Short,

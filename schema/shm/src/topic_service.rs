@@ -9,8 +9,9 @@ use std::marker::PhantomData;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{self, LoanError, ReceiveError, SendError};
-use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::ipc::Service as LocalService;
 use iceoryx2::prelude::{AttributeSet, AttributeVerifier, IceoryxSend, PortFactory, SemanticString};
+use iceoryx2::service::Service;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
 };
@@ -25,15 +26,16 @@ use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher,
 use crate::shortage::check_client;
 
 /// A topic of one sensor.
-pub type TopicService<P> = publish_subscribe::PortFactory<Service, <P as Payload>::Memory, Header>;
+pub type TopicService<P, S = LocalService> =
+    publish_subscribe::PortFactory<S, <P as Payload>::Memory, Header>;
 /// Sends the samples of a topic.
-pub type Publisher<P> = port::publisher::Publisher<Service, <P as Payload>::Memory, Header>;
+pub type Publisher<P, S = LocalService> = port::publisher::Publisher<S, <P as Payload>::Memory, Header>;
 /// Receives the samples of a topic.
-pub type Subscriber<P> = port::subscriber::Subscriber<Service, <P as Payload>::Memory, Header>;
+pub type Subscriber<P, S = LocalService> = port::subscriber::Subscriber<S, <P as Payload>::Memory, Header>;
 /// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
-pub type Sample<P> = iceoryx2::sample::Sample<Service, <P as Payload>::Memory, Header>;
+pub type Sample<P, S = LocalService> = iceoryx2::sample::Sample<S, <P as Payload>::Memory, Header>;
 /// A loaned sample that is not sent yet.
-pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, <P as Payload>::Memory, Header>;
+pub type SampleMut<P, S = LocalService> = iceoryx2::sample_mut::SampleMut<S, <P as Payload>::Memory, Header>;
 
 /// Payload of a topic: `[u8]` (telegram), or a type of this crate.
 pub trait Payload: Debug + 'static {
@@ -50,28 +52,38 @@ pub trait Payload: Debug + 'static {
     ///
     /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it exists with another
     /// layout.
-    fn create(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<TopicService<Self>, Failure>;
+    fn create<S: Service>(
+        node: &Node<S>,
+        sensor: &str,
+        limits: &TopicLimits,
+    ) -> Result<TopicService<Self, S>, Failure>;
 
     /// Returns the topic of `sensor`, for subscribers. `None` if no hub has created it yet.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it has another layout.
-    fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
+    fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<TopicService<Self, S>>, Failure>;
 
     /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::DomainHeld`] if the topic already has a publisher.
-    fn publisher(topic: &TopicService<Self>, limits: &TopicLimits) -> Result<Publisher<Self>, Failure>;
+    fn publisher<S: Service>(
+        topic: &TopicService<Self, S>,
+        limits: &TopicLimits,
+    ) -> Result<Publisher<Self, S>, Failure>;
 
     /// Returns a subscriber of a topic, and announces it to the hub, which sends it the next sample.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
-    fn subscriber(node: &Node, topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
+    fn subscriber<S: Service>(
+        node: &Node<S>,
+        topic: &TopicService<Self, S>,
+    ) -> Result<Subscriber<Self, S>, Failure>;
 
     /// Returns the oldest queued sample, or `None`.
     ///
@@ -79,20 +91,21 @@ pub trait Payload: Debug + 'static {
     ///
     /// Returns [`ReceiveError::ExceedsMaxBorrows`] if [`limits::BORROWED`] samples are held, and
     /// [`ReceiveError::ConnectionFailure`] if the publisher's memory cannot be mapped.
-    fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
+    fn receive<S: Service>(subscriber: &Subscriber<Self, S>)
+    -> Result<Option<Sample<Self, S>>, ReceiveError>;
 
     /// Returns the payload of a sample, in shared memory.
-    fn read(sample: &Sample<Self>) -> &Self;
+    fn read<S: Service>(sample: &Sample<Self, S>) -> &Self;
 
     /// Loans memory for a sample with a default payload. A payload of variable length has `len` bytes, at least a head.
     ///
     /// # Errors
     ///
     /// Returns the library's error if there is no memory, or if `len` is more than the topic was created for.
-    fn loan(publisher: &Publisher<Self>, len: usize) -> Result<SampleMut<Self>, LoanError>;
+    fn loan<S: Service>(publisher: &Publisher<Self, S>, len: usize) -> Result<SampleMut<Self, S>, LoanError>;
 
     /// Returns the payload of a loaned sample.
-    fn write(loan: &mut SampleMut<Self>) -> &mut Self;
+    fn write<S: Service>(loan: &mut SampleMut<Self, S>) -> &mut Self;
 
     /// A payload in the memory of this process.
     type Owned: BorrowMut<Self>;
@@ -114,11 +127,11 @@ macro_rules! payload {
 
             type Memory = $memory;
 
-            fn create(
-                node: &Node,
+            fn create<S: Service>(
+                node: &Node<S>,
                 sensor: &str,
                 limits: &TopicLimits,
-            ) -> Result<TopicService<Self>, Failure> {
+            ) -> Result<TopicService<Self, S>, Failure> {
                 let (service, revision) = (name(&$topic.service(sensor))?, revision($topic)?);
                 create(node, &service, || {
                     let builder = || {
@@ -143,17 +156,20 @@ macro_rules! payload {
                 })
             }
 
-            fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure> {
+            fn open<S: Service>(
+                node: &Node<S>,
+                sensor: &str,
+            ) -> Result<Option<TopicService<Self, S>>, Failure> {
                 let service = name(&$topic.service(sensor))?;
                 let builder = node.service_builder(&service).publish_subscribe::<$memory>();
                 open(node, &service, builder.user_header::<Header>().open())
             }
 
-            fn publisher(
-                topic: &TopicService<Self>,
+            fn publisher<S: Service>(
+                topic: &TopicService<Self, S>,
                 $limits: &TopicLimits,
-            ) -> Result<Publisher<Self>, Failure> {
-                let samples = limits::samples($topic, places::<Self>(topic));
+            ) -> Result<Publisher<Self, S>, Failure> {
+                let samples = limits::samples($topic, places::<Self, S>(topic));
                 let $builder = topic
                     .publisher_builder()
                     .max_loaned_samples(limits::LOANED)
@@ -161,11 +177,14 @@ macro_rules! payload {
                 $sized.create().map_err(|error| no_publisher(topic.name(), error))
             }
 
-            fn subscriber(node: &Node, topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
+            fn subscriber<S: Service>(
+                node: &Node<S>,
+                topic: &TopicService<Self, S>,
+            ) -> Result<Subscriber<Self, S>, Failure> {
                 check_client()?;
                 let subscriber = topic.subscriber_builder().create().map_err(|error| match error {
                     SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
-                        no_place(topic.name(), places::<Self>(topic))
+                        no_place(topic.name(), places::<Self, S>(topic))
                     }
                     other => no_port(topic.name(), &other),
                 })?;
@@ -175,19 +194,24 @@ macro_rules! payload {
                 Ok(subscriber)
             }
 
-            fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
+            fn receive<S: Service>(
+                subscriber: &Subscriber<Self, S>,
+            ) -> Result<Option<Sample<Self, S>>, ReceiveError> {
                 subscriber.receive()
             }
 
-            fn read(sample: &Sample<Self>) -> &Self {
+            fn read<S: Service>(sample: &Sample<Self, S>) -> &Self {
                 $read(sample)
             }
 
-            fn loan($publisher: &Publisher<Self>, $len: usize) -> Result<SampleMut<Self>, LoanError> {
+            fn loan<S: Service>(
+                $publisher: &Publisher<Self, S>,
+                $len: usize,
+            ) -> Result<SampleMut<Self, S>, LoanError> {
                 $loan
             }
 
-            fn write(loan: &mut SampleMut<Self>) -> &mut Self {
+            fn write<S: Service>(loan: &mut SampleMut<Self, S>) -> &mut Self {
                 $write(loan.payload_mut())
             }
 
@@ -246,7 +270,7 @@ macro_rules! payloads {
 scanhub_schema::for_each_topic!(payloads);
 
 /// Returns the number of places for subscribers that `topic` was created with.
-pub fn places<P: Payload + ?Sized>(topic: &TopicService<P>) -> usize {
+pub fn places<P: Payload + ?Sized, S: Service>(topic: &TopicService<P, S>) -> usize {
     topic.static_config().max_subscribers()
 }
 
@@ -301,12 +325,12 @@ pub trait Medium<P: Payload + ?Sized> {
 
 /// A topic in the shared memory of a domain.
 #[derive(Debug)]
-pub struct SharedMemory<P: Payload + ?Sized> {
-    publisher: Publisher<P>,
-    service: TopicService<P>,
+pub struct SharedMemory<P: Payload + ?Sized, S: Service = LocalService> {
+    publisher: Publisher<P, S>,
+    service: TopicService<P, S>,
 }
 
-impl<P: Payload + ?Sized> SharedMemory<P> {
+impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
     /// Creates the topic of `sensor` with payload `P` and `limits`, or takes over the topic of a dead process. The
     /// [`Waker`](crate::Waker) of the sensor must exist before.
     ///
@@ -314,7 +338,7 @@ impl<P: Payload + ?Sized> SharedMemory<P> {
     ///
     /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::Short`] if memory or descriptors
     /// are short, and [`Kind::Failed`] if the topic exists with another layout.
-    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+    pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
         let service = P::create(node, sensor, limits)?;
         Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })
     }
@@ -322,30 +346,30 @@ impl<P: Payload + ?Sized> SharedMemory<P> {
     /// Returns the number of places for subscribers. A topic that was taken over may have another number than its
     /// limits.
     pub fn places(&self) -> usize {
-        places::<P>(&self.service)
+        places::<P, S>(&self.service)
     }
 }
 
-impl<P: Payload + ?Sized> Medium<P> for SharedMemory<P> {
-    type Loan = SampleMut<P>;
+impl<P: Payload + ?Sized, S: Service> Medium<P> for SharedMemory<P, S> {
+    type Loan = SampleMut<P, S>;
 
     fn subscribers(&self) -> usize {
         self.service.dynamic_config().number_of_subscribers()
     }
 
-    fn connect(&self) -> Result<(), impl Debug + use<P>> {
+    fn connect(&self) -> Result<(), impl Debug + use<P, S>> {
         self.publisher.update_connections()
     }
 
-    fn loan(&self, len: usize) -> Result<SampleMut<P>, LoanError> {
+    fn loan(&self, len: usize) -> Result<SampleMut<P, S>, LoanError> {
         P::loan(&self.publisher, len)
     }
 
-    fn payload_mut(loan: &mut SampleMut<P>) -> &mut P {
+    fn payload_mut(loan: &mut SampleMut<P, S>) -> &mut P {
         P::write(loan)
     }
 
-    fn send(&self, mut loan: SampleMut<P>, header: &Header) -> Result<usize, SendError> {
+    fn send(&self, mut loan: SampleMut<P, S>, header: &Header) -> Result<usize, SendError> {
         *loan.user_header_mut() = *header;
         loan.send()
     }
@@ -361,13 +385,13 @@ pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
     payload: PhantomData<fn(&P)>,
 }
 
-impl<P: Payload + ?Sized> TopicPublisher<P> {
+impl<P: Payload + ?Sized, S: Service> TopicPublisher<P, SharedMemory<P, S>> {
     /// Creates a publisher into shared memory. Otherwise the same as [`over`](TopicPublisher::over).
     ///
     /// # Errors
     ///
     /// Returns the errors of [`SharedMemory::new`].
-    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+    pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
         SharedMemory::new(node, sensor, limits).map(TopicPublisher::over)
     }
 }

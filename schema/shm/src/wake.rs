@@ -10,8 +10,9 @@ use std::time::Duration;
 
 use iceoryx2::port;
 use iceoryx2::port::listener::{ListenerCreateError, ListenerWaitError};
-use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::ipc::Service as LocalService;
 use iceoryx2::prelude::{EventId, FileDescriptorBased, PortFactory};
+use iceoryx2::service::Service;
 use iceoryx2::service::port_factory::event;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
@@ -24,28 +25,28 @@ use crate::service::{OpenFailure, create, full, name, no_port, open};
 use crate::shortage::check_client;
 
 /// Event service that wakes the subscribers of one sensor.
-pub type WakeService = event::PortFactory<Service>;
+pub type WakeService<S = LocalService> = event::PortFactory<S>;
 /// Wakes subscribers.
-pub type Notifier = port::notifier::Notifier<Service>;
+pub type Notifier<S = LocalService> = port::notifier::Notifier<S>;
 /// Sleeps until it is woken.
-pub type Listener = port::listener::Listener<Service>;
+pub type Listener<S = LocalService> = port::listener::Listener<S>;
 
 /// The hub's end. It wakes subscribers with [`Wake::HubUp`] when it is created, and with [`Wake::HubDown`] when it is
 /// dropped.
-pub struct Waker {
+pub struct Waker<S: Service = LocalService> {
     ringer: DoorbellRinger,
-    notifier: Notifier,
-    service: WakeService,
+    notifier: Notifier<S>,
+    service: WakeService<S>,
 }
 
-impl Waker {
+impl<S: Service> Waker<S> {
     /// Creates the waker of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
     /// sleeps at it.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if memory is short, and [`Kind::Failed`] if the service has another layout.
-    pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
+    pub fn new(node: &Node<S>, sensor: &str) -> Result<Waker<S>, Failure> {
         let ringer = DoorbellRinger::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
         Ok(Waker { ringer, notifier: notifier(&service, Wake::Telegram as usize)?, service })
@@ -92,7 +93,7 @@ impl Waker {
     }
 
     /// Returns the event service.
-    pub fn service(&self) -> &WakeService {
+    pub fn service(&self) -> &WakeService<S> {
         &self.service
     }
 }
@@ -113,7 +114,7 @@ impl DueRings {
     }
 }
 
-fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
+fn create_service<S: Service>(node: &Node<S>, sensor: &str) -> Result<WakeService<S>, Failure> {
     let service = name(&Wake::service(sensor))?;
     create(node, &service, || {
         let builder = node.service_builder(&service).event();
@@ -135,18 +136,21 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
 /// # Errors
 ///
 /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the service has another layout.
-pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
+pub fn open_wake<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<WakeService<S>>, Failure> {
     open_event(node, &Wake::service(sensor))
 }
 
 /// Returns the event service `service`; `None` if it does not exist.
-pub(crate) fn open_event(node: &Node, service: &str) -> Result<Option<WakeService>, Failure> {
+pub(crate) fn open_event<S: Service>(
+    node: &Node<S>,
+    service: &str,
+) -> Result<Option<WakeService<S>>, Failure> {
     let service = name(service)?;
     open(node, &service, node.service_builder(&service).event().open())
 }
 
 /// Returns a notifier of the event whose default event ID is `event`.
-pub(crate) fn notifier(service: &WakeService, event: usize) -> Result<Notifier, Failure> {
+pub(crate) fn notifier<S: Service>(service: &WakeService<S>, event: usize) -> Result<Notifier<S>, Failure> {
     let builder = service.notifier_builder().default_event_id(EventId::new(event));
     builder.create().map_err(|error| no_port(service.name(), &error))
 }
@@ -156,7 +160,7 @@ pub(crate) fn notifier(service: &WakeService, event: usize) -> Result<Notifier, 
 /// # Errors
 ///
 /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
-pub fn listener(node: &Node, wake: &WakeService) -> Result<Listener, Failure> {
+pub fn listener<S: Service>(node: &Node<S>, wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     let listener = create_listener(wake)?;
     if let Some((sensor, _)) = of_service(wake.name().as_str()) {
         note_attached(node, sensor);
@@ -165,7 +169,7 @@ pub fn listener(node: &Node, wake: &WakeService) -> Result<Listener, Failure> {
 }
 
 /// Returns a listener of any event.
-pub(crate) fn create_listener(wake: &WakeService) -> Result<Listener, Failure> {
+pub(crate) fn create_listener<S: Service>(wake: &WakeService<S>) -> Result<Listener<S>, Failure> {
     check_client()?;
     wake.listener_builder().create().map_err(|error| match error {
         ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
@@ -179,7 +183,10 @@ pub(crate) fn create_listener(wake: &WakeService) -> Result<Listener, Failure> {
 /// # Errors
 ///
 /// Returns [`Kind::Short`] if the system cannot wait.
-pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
+pub fn sleep<S: Service>(listeners: &[&Listener<S>], timeout: Duration) -> Result<(), Failure>
+where
+    Listener<S>: FileDescriptorBased,
+{
     let mut fds: Vec<PollFd<'_>> = listeners
         .iter()
         .map(|listener| PollFd::from_borrowed_fd(descriptor(listener), PollFlags::IN))
@@ -193,7 +200,10 @@ pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> 
 
 /// Returns a descriptor that is readable while wake-ups of `listener` are pending, for programs that also wait for
 /// other things.
-pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
+pub fn descriptor<S: Service>(listener: &Listener<S>) -> BorrowedFd<'_>
+where
+    Listener<S>: FileDescriptorBased,
+{
     // SAFETY: the descriptor is open while the listener lives, and the listener is borrowed as long as the result.
     unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
 }
@@ -204,7 +214,7 @@ pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
 /// # Errors
 ///
 /// Returns [`Kind::Short`] if a listener does not work.
-pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {
+pub fn take_wakeups<S: Service>(listeners: &[&Listener<S>]) -> Result<bool, Failure> {
     let mut any = false;
     for listener in listeners {
         match listener.try_wait(|_| any = true) {

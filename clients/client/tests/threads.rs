@@ -1,0 +1,101 @@
+//! Subscribers, samples and publications in other threads than the one that made them.
+
+mod fake;
+
+use std::sync::mpsc;
+use std::thread;
+use std::time::Duration;
+
+use fake::{FakeHub, Place, until};
+use scanhub_client::{
+    Marks, Publication, PublishSession, Received, RobotFollower, Scan, SensorPublisher, Subscription,
+    ZonesFollower, streams,
+};
+use scanhub_schema::limits::BORROWED;
+use scanhub_shm::{LocalService, Payload, PortFactory, Role, Service, Subscriber, ThreadSafeService};
+
+/// Far longer than anything takes on a busy machine.
+const LONG: Duration = Duration::from_secs(60);
+
+fn is_send<T: Send>() {}
+
+#[test]
+fn all_types_of_the_interface_are_send() {
+    is_send::<Subscription<Scan>>();
+    is_send::<Subscription<[u8]>>();
+    is_send::<Received<Scan>>();
+    is_send::<Publication<Marks>>();
+    is_send::<PublishSession>();
+    is_send::<SensorPublisher>();
+    is_send::<ZonesFollower>();
+    is_send::<RobotFollower>();
+    is_send::<streams::Session>();
+    is_send::<streams::Source>();
+}
+
+/// Attaches to the scans of `front` with ports of kind `S`.
+fn attach<S: Service>(place: &Place) -> (scanhub_shm::Node<S>, Subscriber<Scan, S>) {
+    let node = scanhub_shm::join::<S>(&place.domain, Role::Subscriber).unwrap();
+    let topic = Scan::open(&node, "front").unwrap().expect("the hub made it");
+    let subscriber = Scan::subscriber(&node, &topic).unwrap();
+    (node, subscriber)
+}
+
+#[test]
+fn both_kinds_of_service_attach_to_one_hub() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let local = attach::<LocalService>(&place);
+    let shared = attach::<ThreadSafeService>(&place);
+    assert_eq!(hub.front().scan.subscribers(), 2);
+    for beams in 1..=3 {
+        hub.front().scan(&vec![1000; beams]);
+        let of_local = Scan::receive(&local.1).unwrap().expect("one was sent");
+        let of_shared = Scan::receive(&shared.1).unwrap().expect("one was sent");
+        for beams_received in [Scan::read(&of_local).beams(), Scan::read(&of_shared).beams()] {
+            assert_eq!(beams_received, beams);
+        }
+    }
+    drop((local, shared));
+    until("no subscribers", || hub.front().scan.service.dynamic_config().number_of_subscribers() == 0);
+}
+
+#[test]
+fn a_subscriber_and_its_samples_move_between_threads() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(LONG);
+    assert!(scans.try_next().unwrap().is_none());
+    let (give, take) = mpsc::channel();
+    let thread = thread::spawn(move || {
+        for _ in 0..3 * BORROWED {
+            let Some(scan) = scans.next().unwrap() else { panic!("no scan") };
+            give.send(scan).unwrap();
+        }
+        scans
+    });
+    for beams in 1..=3 * BORROWED {
+        hub.front().scan(&vec![1000; beams]);
+        // Dropped in this thread, so the slot is free again for the other one.
+        let scan = take.recv_timeout(LONG).expect("a scan");
+        assert_eq!((scan.beams(), scan.missed), (beams, 0));
+    }
+    let mut scans = thread.join().unwrap();
+    hub.front().scan(&[7]);
+    assert_eq!(scans.next().unwrap().expect("a scan").beams(), 1);
+}
+
+#[test]
+fn a_publication_moves_to_another_thread() {
+    let place = Place::new();
+    let mut near = Publication::<Marks>::in_domain(&place.domain, "tracker.near").unwrap();
+    let mut marks = Subscription::<Marks>::in_domain(place.places(), "tracker.near").unwrap().timeout(LONG);
+    until("the subscriber", || marks.try_next().unwrap().is_none() && near.subscribers() == 1);
+    let near = thread::spawn(move || {
+        near.send(|sample| *sample = Marks::default()).unwrap();
+        near
+    });
+    let near = near.join().unwrap();
+    assert_eq!(marks.next().unwrap().expect("one was sent").header().topic_seq, 0);
+    assert_eq!(near.next_number(), 1);
+}
