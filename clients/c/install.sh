@@ -7,6 +7,8 @@
 #
 # DESTDIR=DIR puts everything below DIR, for those who make packages.
 set -eu
+# Debian's users do not have ldconfig in PATH.
+PATH=$PATH:/usr/sbin:/sbin
 
 here=$(cd "$(dirname "$0")" && pwd)
 prefix=/usr/local
@@ -41,21 +43,36 @@ link() { # target, name
     ln -sf "$1" "$root/$2"
     echo "$root/$2"
 }
-refresh() { # where programs are told of libraries
+refresh() { # the loader's list of libraries
     if [ -z "${DESTDIR:-}" ] && [ "$(id -u)" = 0 ] && command -v ldconfig > /dev/null; then
         ldconfig
     fi
 }
+explain() { # how a program finds the library, if the loader does not find it in this prefix
+    [ -z "${DESTDIR:-}" ] || return 0
+    found=$(ldconfig -p 2> /dev/null | sed -n 's/.*libscanhub\.so\.0 .*=> //p' | head -n 1)
+    if [ "$found" -ef "$prefix/lib/libscanhub.so.0" ]; then
+        return
+    fi
+    case $(ldconfig -N -X -v 2> /dev/null || true) in
+    "$prefix/lib:"* | *"
+$prefix/lib:"*)
+        echo "run \`sudo ldconfig\`, so that programs find the library" ;;
+    *)
+        echo "the loader does not search $prefix/lib; link programs with -Wl,-rpath,$prefix/lib" ;;
+    esac
+}
 
 if [ "$action" = remove ]; then
     for file in lib/libscanhub.so lib/libscanhub.so.0 lib/libscanhub.so."$version" lib/libscanhub.a \
-        lib/pkgconfig/scanhub.pc include/scanhub/attach.h include/scanhub/attach.hpp; do
+        lib/pkgconfig/scanhub.pc lib/cmake/scanhub/scanhub-config.cmake lib/cmake/scanhub/scanhub-config-version.cmake \
+        include/scanhub/attach.h include/scanhub/attach.hpp; do
         if [ -e "$root/$file" ] || [ -L "$root/$file" ]; then
             rm "$root/$file"
             echo "removed $root/$file"
         fi
     done
-    rmdir "$root/include/scanhub" 2> /dev/null || true
+    rmdir "$root/include/scanhub" "$root/lib/cmake/scanhub" 2> /dev/null || true
     refresh
     exit 0
 fi
@@ -74,6 +91,12 @@ put "$here/include/scanhub/attach.h" include/scanhub/attach.h 644
 put "$here/include/scanhub/attach.hpp" include/scanhub/attach.hpp 644
 made=$(mktemp)
 trap 'rm "$made"' EXIT
-sed -e "s|@PREFIX@|$prefix|" -e "s|@VERSION@|$version|" "$here/scanhub.pc.in" > "$made"
-put "$made" lib/pkgconfig/scanhub.pc 644
+fill() { # template, destination
+    sed -e "s|@PREFIX@|$prefix|" -e "s|@VERSION@|$version|" "$1" > "$made"
+    put "$made" "$2" 644
+}
+fill "$here/scanhub.pc.in" lib/pkgconfig/scanhub.pc
+put "$here/cmake/scanhub-config.cmake" lib/cmake/scanhub/scanhub-config.cmake 644
+fill "$here/cmake/scanhub-config-version.cmake" lib/cmake/scanhub/scanhub-config-version.cmake
 refresh
+explain

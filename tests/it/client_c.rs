@@ -289,8 +289,11 @@ fn the_examples_build_and_run() {
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/examples");
     let mut built = vec![installed.compile(&env, &examples.join("nearest.c"), &[])];
     built.extend(installed.compile_static(&env, &examples.join("nearest.c")));
+    built.extend(installed.compile_with_pkg_config(&env, &examples.join("nearest.c")));
     let cmake = installed.cmake(&env, &examples);
     built.extend(cmake.iter().map(|build| build.join("nearest")));
+    // Only the sources have the static library, because its copy would take 100 MB.
+    built.extend(cmake.iter().skip(1).map(|build| build.join("nearest_static")));
     for nearest in &built {
         let outcome = program(&env, nearest, &["front", "5"]).wait();
         assert_eq!(outcome.code, Some(0), "{outcome}");
@@ -330,6 +333,25 @@ fn the_examples_build_and_run() {
 }
 
 #[test]
+fn cpp_20_has_optional_samples_and_spans() {
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let Some(modern) = installed.compile_cpp20(&env, &source("modern.cpp")) else { return };
+    let _simulator = env.simulator(&["front"], &["--seed=37"]);
+    let _hub = env.hub(&[env.link("front")]);
+    let outcome = program(&env, &modern, &["front"]).wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(String::from_utf8_lossy(&outcome.out), "361\n".repeat(5), "{outcome}");
+}
+
+#[test]
+fn install_script_says_how_programs_find_the_library() {
+    let Some(installed) = Installed::once() else { return };
+    let flag = format!("link programs with -Wl,-rpath,{}", installed.prefix.join("lib").display());
+    assert!(installed.messages.trim_end().ends_with(&flag), "{}", installed.messages);
+}
+
+#[test]
 fn what_is_installed_is_taken_away_again() {
     let Some(installed) = Installed::once() else { return };
     let env = TestEnv::new();
@@ -344,14 +366,22 @@ fn what_is_installed_is_taken_away_again() {
         succeeded(&run(&["--prefix", "/opt/robot"]));
     }
     let below = destination.join("opt/robot");
-    for file in
-        ["lib/libscanhub.so", "lib/libscanhub.so.0", "include/scanhub/attach.h", "include/scanhub/attach.hpp"]
-    {
+    for file in [
+        "lib/libscanhub.so",
+        "lib/libscanhub.so.0",
+        "include/scanhub/attach.h",
+        "include/scanhub/attach.hpp",
+        "lib/cmake/scanhub/scanhub-config.cmake",
+    ] {
         assert!(below.join(file).is_file(), "{file}");
     }
     let description = std::fs::read_to_string(below.join("lib/pkgconfig/scanhub.pc")).expect("is there");
     assert!(description.contains("prefix=/opt/robot\n"), "{description}");
     assert!(description.contains(concat!("Version: ", env!("CARGO_PKG_VERSION"), "\n")), "{description}");
+    let version = below.join("lib/cmake/scanhub/scanhub-config-version.cmake");
+    let version = std::fs::read_to_string(version).expect("a version file");
+    let line = concat!("set(PACKAGE_VERSION \"", env!("CARGO_PKG_VERSION"), "\")\n");
+    assert!(version.contains(line), "{version}");
     succeeded(&run(&["--prefix", "/opt/robot", "--remove"]));
     let left = output(Command::new("find").arg(&destination).args(["!", "-type", "d"])).expect("find");
     assert_eq!(succeeded(&left), "");

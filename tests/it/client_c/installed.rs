@@ -11,9 +11,11 @@ use crate::testkit::{TestEnv, output, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
-    prefix: PathBuf,
+    pub(crate) prefix: PathBuf,
     /// Where it was installed from.
     pub(crate) library: PathBuf,
+    /// Output of the script that installed it.
+    pub(crate) messages: String,
 }
 
 /// As strictly as it goes.
@@ -37,8 +39,9 @@ impl Installed {
                 .expect("a place for a link");
             let mut command = Command::new(top().join("clients/c/install.sh"));
             command.arg("--prefix").arg(&prefix).arg("--library").arg(&library).env_remove("DESTDIR");
-            done(&output(command).expect("there is a shell")).unwrap_or_else(|said| panic!("{said}"));
-            Installed { prefix, library }
+            let messages = output(command).expect("a shell");
+            let messages = done(&messages).unwrap_or_else(|errors| panic!("{errors}"));
+            Installed { prefix, library, messages }
         }))
     }
 
@@ -64,6 +67,13 @@ impl Installed {
         Some(built.unwrap_or_else(|said| panic!("{said}")))
     }
 
+    /// Returns the program of `source` in C++20. `None` if there is no compiler for it.
+    pub(crate) fn compile_cpp20(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        let built =
+            is_there("c++").then(|| self.build("c++", env, source, &["-std=c++20"], &self.shared()))?;
+        Some(built.unwrap_or_else(|errors| panic!("{errors}")))
+    }
+
     /// As [`compile_cpp`](Self::compile_cpp); what the compiler says if it does not.
     pub(crate) fn try_compile_cpp(&self, env: &TestEnv, source: &Path) -> Option<Result<PathBuf, String>> {
         is_there("c++").then(|| self.build("c++", env, source, &["-std=c++11"], &self.shared()))
@@ -83,18 +93,45 @@ impl Installed {
         Some(program.unwrap_or_else(|said| panic!("{said}")))
     }
 
-    /// The directory in which CMake built what `source` describes; nothing where it is not there.
-    pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
-        if !["cmake", "pkg-config", "c++"].into_iter().all(is_there) {
-            return None;
+    /// Builds the project `source` with CMake in each way in which the package is found, and returns the build
+    /// directories. Empty if a tool is missing.
+    pub(crate) fn cmake(&self, env: &TestEnv, source: &Path) -> Vec<PathBuf> {
+        if !["cmake", "c++"].into_iter().all(is_there) {
+            return Vec::new();
         }
-        let build = env.path("cmake");
-        let mut configure = self.with_packages(Command::new("cmake"));
-        configure.arg("-S").arg(source).arg("-B").arg(&build);
-        for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
-            done(&output(command).expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
-        }
-        Some(build)
+        // A package that names its own prefix does not work after this.
+        let moved = env.path("moved");
+        let mut copy = Command::new("cp");
+        copy.arg("-a").arg(&self.prefix).arg(&moved);
+        done(&output(copy).expect("cp")).unwrap_or_else(|errors| panic!("{errors}"));
+        let sources = vec![
+            format!("-Dscanhub_DIR={}", top().join("clients/c/cmake").display()),
+            format!("-Dscanhub_LIBRARY_DIR={}", built().display()),
+        ];
+        let ways =
+            [("prefix", vec![format!("-DCMAKE_PREFIX_PATH={}", moved.display())]), ("sources", sources)];
+        let build_in = |(name, flags): (&str, Vec<String>)| {
+            let build = env.path(&format!("cmake-{name}"));
+            let mut configure = Command::new("cmake");
+            configure.arg("-S").arg(source).arg("-B").arg(&build).args(flags);
+            for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
+                done(&output(command).expect("CMake")).unwrap_or_else(|errors| panic!("{errors}"));
+            }
+            build
+        };
+        ways.map(build_in).into()
+    }
+
+    /// Builds `source` with the flags of pkg-config. `None` if there is no pkg-config.
+    pub(crate) fn compile_with_pkg_config(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
+        let is_missing = || skip("pkg-config", "there is none");
+        let flags =
+            output(self.with_packages(Command::new("pkg-config")).args(["--cflags", "--libs", "scanhub"]));
+        let flags = flags.inspect_err(|_| is_missing()).ok()?;
+        let flags = done(&flags).unwrap_or_else(|errors| panic!("{errors}"));
+        let mut flags: Vec<String> = flags.split_whitespace().map(str::to_owned).collect();
+        flags.extend(self.shared().pop());
+        Some(self.build("cc", env, source, &["-std=c99"], &flags).unwrap_or_else(|errors| panic!("{errors}")))
     }
 
     fn build<S: AsRef<OsStr>>(

@@ -16,8 +16,13 @@
  * The hub need not run yet: the library waits for it, and for the next one after it ends or is killed. A program that is too
  * slow misses samples and sees how many; it never slows the hub.
  *
- * A handle belongs to the thread that opened it; other threads open handles of their own. All functions may be called with
- * a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own, and may end as it likes.
+ * Threads: a handle or publication belongs to the thread that opened it, and ends with this thread. Other threads open their
+ * own; calls with another thread's handle are refused. A sample is released by its handle's thread. Until then, any thread may
+ * read its header and payload, and pass it to the functions that only read. scanhub_error has the errors of the calling
+ * thread. All functions may be called at the same time in different threads, but not in signal handlers.
+ *
+ * All functions may be called with a handle that was closed, or with NULL: they refuse it. A child after fork() opens its own,
+ * and may end as it likes.
  *
  * Functions return 0 or more. A negative number is one of SCANHUB_REFUSED_..; scanhub_error() then has the message and the
  * remedy. Signals are never an error.

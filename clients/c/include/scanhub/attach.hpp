@@ -1,6 +1,9 @@
 /*
  * The same for C++11 and later: what scanhub_open opens and scanhub_take lends is given back at the end of its scope, and a
- * refusal is an exception. <scanhub/attach.h> has the words.
+ * refusal is an exception. <scanhub/attach.h> has the words. C++17 adds functions that return std::optional, and a library
+ * with std::span adds functions that return the arrays of a sample.
+ *
+ * An object belongs to the thread that made it, and so do its samples: another thread may read a sample, but not release it.
  *
  *     scanhub::Attachment scans("front", SCANHUB_TOPIC_SCAN);
  *     while (scanhub::Sample sample = scans.next())
@@ -13,6 +16,13 @@
 
 #include <stdexcept>
 #include <utility>
+#if __cplusplus >= 201703L
+#include <chrono>
+#include <optional>
+#endif
+#if __cplusplus >= 202002L
+#include <span>
+#endif
 
 namespace scanhub {
 
@@ -135,6 +145,18 @@ public:
     {
         return check(scanhub_wait(handle_, timeout_ms)) == 1 ? take() : Sample();
     }
+#if __cplusplus >= 201703L
+    /* The next sample, or std::nullopt if none has arrived. Never waits. */
+    std::optional<Sample> try_next() { return present(take()); }
+    /* Waits for the next sample. Returns std::nullopt after `timeout`. */
+    std::optional<Sample> next_within(std::chrono::milliseconds timeout)
+    {
+        // A longer timeout than an int holds is shortened, so that it is not negative.
+        const auto longest = std::chrono::milliseconds(0x7FFFFFFF);
+        const auto waited = timeout < timeout.zero() ? timeout.zero() : timeout > longest ? longest : timeout;
+        return present(next(static_cast<int>(waited.count())));
+    }
+#endif
     /* As scanhub_fd. */
     int fd() { return check(scanhub_fd(handle_)); }
     /* As scanhub_hub_lives. */
@@ -142,9 +164,61 @@ public:
 
 private:
     Attachment() : handle_(nullptr), topic_(0) {}
+#if __cplusplus >= 201703L
+    static std::optional<Sample> present(Sample sample)
+    {
+        return sample ? std::optional<Sample>(std::move(sample)) : std::nullopt;
+    }
+#endif
     scanhub_attachment *handle_;
     int topic_;
 };
+
+#ifdef __cpp_lib_span
+/*
+ * Arrays of a sample in shared memory, valid until the sample is released. A sample of another topic throws
+ * std::logic_error, and one without the array gives an empty span.
+ */
+
+/* The ranges of a scan in device units. Values above the head's `valid_to` are codes. */
+inline std::span<const uint16_t> ranges(const Sample &scan)
+{
+    scan.as<scanhub_scan_v2>();
+    return {scanhub_ranges(&*scan), scanhub_count(&*scan)};
+}
+
+/* The segments of a foreground. */
+inline std::span<const scanhub_segment_v2> segments(const Sample &foreground)
+{
+    const scanhub_foreground_v2 &head = foreground.as<scanhub_foreground_v2>();
+    const scanhub_segment_v2 *const first = scanhub_segments(&*foreground);
+    return {first, first == nullptr ? 0u : head.segments};
+}
+
+/* The ranges of a foreground in device units, one for each of its beams. */
+inline std::span<const uint16_t> foreground_ranges(const Sample &foreground)
+{
+    const scanhub_foreground_v2 &head = foreground.as<scanhub_foreground_v2>();
+    const uint16_t *const first = scanhub_foreground_ranges(&*foreground);
+    return {first, first == nullptr ? 0u : head.beams};
+}
+
+/* The ranges of a background in device units, one for each beam. */
+inline std::span<const uint16_t> background_ranges(const Sample &background)
+{
+    const scanhub_background_v2 &head = background.as<scanhub_background_v2>();
+    const uint16_t *const first = scanhub_background_ranges(&*background);
+    return {first, first == nullptr ? 0u : head.count};
+}
+
+/* The points of a cloud. */
+inline std::span<const scanhub_cloud_point_v2> cloud_points(const Sample &cloud)
+{
+    const scanhub_cloud_v2 &head = cloud.as<scanhub_cloud_v2>();
+    const scanhub_cloud_point_v2 *const first = scanhub_cloud_points(&*cloud);
+    return {first, first == nullptr ? 0u : head.count};
+}
+#endif
 
 /* The angles of a mount that this thread publishes, as scanhub_publish_tilt. */
 class TiltPublication {
