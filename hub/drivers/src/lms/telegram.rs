@@ -201,7 +201,12 @@ impl Checksum {
     /// for the next call.
     pub(crate) fn extend(&mut self, bytes: &[u8]) {
         let (words, _) = bytes[self.len..].as_chunks();
-        self.sum = words.iter().fold(self.sum, |sum, &word| times_x(sum, 8) ^ polynomial(word));
+        let add = |(sum, carry), &word| {
+            let (sum, high) = shift(sum, 8);
+            (sum ^ polynomial(word), carry ^ high)
+        };
+        let (sum, carry) = words.iter().fold((self.sum, 0), add);
+        self.sum = sum ^ residue(carry);
         self.len += 8 * words.len();
     }
 
@@ -214,13 +219,27 @@ impl Checksum {
     }
 }
 
-/// Returns `sum * x^power`; `power` is at most 8. If a polynomial h has an even number of terms, `h * x^16` is
-/// `h * (x^2 + x)`. Otherwise, it is greater by x^15 + x + 1.
+/// Returns `sum * x^power`; `power` is at most 8.
 #[inline]
 fn times_x(sum: u16, power: u32) -> u16 {
+    let (product, high) = shift(sum, power);
+    product ^ residue(high)
+}
+
+/// Returns `sum * x^power` without the [`residue`] of the polynomial that it also returns: of h, the part of the product
+/// from x^16 on. `h * x^16` is `h * (x^2 + x)` and that residue.
+#[inline]
+fn shift(sum: u16, power: u32) -> (u16, u16) {
     let high = sum >> (16 - power);
-    let odd = (high.count_ones() as u16 & 1).wrapping_neg();
-    (sum << power) ^ (high << 2) ^ (high << 1) ^ (odd & 0x8003)
+    ((sum << power) ^ (high << 2) ^ (high << 1), high)
+}
+
+/// Returns x^15 + x + 1 if `polynomial` has an odd number of terms, otherwise 0. A product with x has the same residue,
+/// so the residues of many steps are added at once.
+#[inline]
+fn residue(polynomial: u16) -> u16 {
+    let odd = (polynomial.count_ones() as u16 & 1).wrapping_neg();
+    odd & 0x8003
 }
 
 /// Returns the sum of eight bytes, the first one multiplied by x^7 and the last one by 1.
