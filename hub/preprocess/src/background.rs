@@ -455,7 +455,7 @@ fn is_foreground(class: Class) -> bool {
 
 /// Returns the index of the first value from `from` on that `is_it`. Such values are rare, so whole blocks are
 /// compared, without a branch for each value.
-fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
+pub(crate) fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
     const BLOCK: usize = 32;
     let mut begin = from;
     while let Some(block) = values[begin..].first_chunk::<BLOCK>() {

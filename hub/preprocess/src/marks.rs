@@ -3,8 +3,9 @@
 
 use std::f64::consts::{PI, TAU};
 
-use scanhub_schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
+use scanhub_schema::{Contents, Family, Intensities, MARKS, Mark, Marks, Scan, in_degrees};
 
+use crate::background::position;
 use crate::directions::exact_angle;
 
 /// Settings of a mark detector.
@@ -75,11 +76,13 @@ impl MarkDetector {
             None => overflow = true,
         };
         let unit_um = scan.unit_um;
+        let intensities = scan.intensities();
         let mut open: Option<Open> = None;
-        for (i, intensity) in scan.intensities().iter().enumerate() {
-            if intensity < least && open.is_none() {
-                continue;
-            }
+        let mut next = 0;
+        while let Some(i) = if open.is_some() { Some(next) } else { first_bright(&intensities, next, least) }
+            && let Some(intensity) = intensities.get(i)
+        {
+            next = i + 1;
             match (scan.range(i).filter(|_| intensity >= least), &mut open) {
                 (Some(value), Some(mark)) if mark.is_near(value, unit_um, &self.settings) => {
                     mark.join(scan, i, value, intensity);
@@ -99,6 +102,17 @@ impl MarkDetector {
         open.inspect(&mut push);
         out.count = count as u8;
         out.flags = if overflow { Marks::OVERFLOW } else { 0 };
+    }
+}
+
+/// Returns the first beam from `from` on that has at least the intensity `least`.
+fn first_bright(intensities: &Intensities<'_>, from: usize, least: u16) -> Option<usize> {
+    match intensities {
+        Intensities::Narrow(values) => {
+            let least = u8::try_from(least).ok()?;
+            position(values, from, |value| value >= least)
+        }
+        Intensities::Wide(values) => position(values, from, |value| value >= least),
     }
 }
 

@@ -417,7 +417,8 @@ impl Table {
             return self.met_exactly(ranges, angles);
         }
         let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
-        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges)), nearest }
+        let shortest = &self.nearest.shortest;
+        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges, shortest)), nearest }
     }
 
     /// Returns the points inside the circles of a scan with exact angles. Only points that are near enough to be inside
@@ -531,8 +532,10 @@ struct Nearest {
     seen: Spans,
     /// Twice s.u for each beam, in device units, with the sensor's position s and the beam's direction u.
     twice_q: Box<[f64]>,
-    /// For each block of beams: the minimum of `twice_q`, and the lower bound of its readings in the current scan.
+    /// For each block of beams: the minimum of `twice_q`, the shortest reading that counts in the current scan, and the
+    /// lower bound of its readings.
     least_twice_q: Box<[f64]>,
+    shortest: Box<[u16]>,
     bounds: Box<[f64]>,
 }
 
@@ -544,6 +547,7 @@ impl Nearest {
             seen: Spans::none(beams),
             twice_q: vec![0.0; beams].into(),
             least_twice_q: blocks.clone(),
+            shortest: vec![u16::MAX; blocks.len()].into(),
             bounds: blocks,
         }
     }
@@ -574,12 +578,21 @@ impl Nearest {
 
     /// Computes the lower bound of each block: its shortest reading that counts, along its most favorable beam.
     fn bound(&mut self, ranges: &[u16]) {
-        let blocks = ranges.chunks(BLOCK).zip(self.seen.from.chunks(BLOCK));
-        for ((bound, (ranges, from)), &twice_q) in self.bounds.iter_mut().zip(blocks).zip(&self.least_twice_q)
+        let (blocks, rest) = ranges.as_chunks::<BLOCK>();
+        let (from_blocks, from_rest) = self.seen.from[..ranges.len()].as_chunks::<BLOCK>();
+        // A code is greater than any range, so it does no harm here.
+        let shortest = |ranges: &[u16], from: &[u16]| {
+            ranges.iter().zip(from).map(|(&range, &from)| range.max(from)).fold(u16::MAX, u16::min)
+        };
+        for ((value, ranges), from) in self.shortest.iter_mut().zip(blocks).zip(from_blocks) {
+            *value = shortest(ranges, from);
+        }
+        if let Some(value) = self.shortest.get_mut(blocks.len()) {
+            *value = shortest(rest, from_rest);
+        }
+        for ((bound, &shortest), &twice_q) in
+            self.bounds.iter_mut().zip(&self.shortest).zip(&self.least_twice_q)
         {
-            // A code is greater than any range, so it does no harm here.
-            let shortest =
-                ranges.iter().zip(from).map(|(&range, &from)| range.max(from)).fold(u16::MAX, u16::min);
             let (shortest, turn) = (f64::from(shortest), -0.5 * twice_q);
             let value = if shortest > turn { shortest } else { turn };
             *bound = value * (value + twice_q);
@@ -610,24 +623,29 @@ struct Spans {
     /// Minimum value; the maximum of the type for beams that do not exist.
     from: Box<[u16]>,
     len: Box<[u16]>,
+    /// For each block of beams: the first value from which on none counts.
+    ends: Box<[u16]>,
 }
 
 impl Spans {
     /// Creates empty spans of `beams` beams.
     fn none(beams: usize) -> Spans {
-        Spans { from: vec![u16::MAX; beams].into(), len: vec![0; beams].into() }
+        let ends = vec![0; beams.div_ceil(BLOCK)].into();
+        Spans { from: vec![u16::MAX; beams].into(), len: vec![0; beams].into(), ends }
     }
 
     /// Makes all spans empty.
     fn clear(&mut self) {
         self.from.fill(u16::MAX);
         self.len.fill(0);
+        self.ends.fill(0);
     }
 
     /// Sets the values of beam `i` that count: from `from`, below `below`.
     fn set(&mut self, i: usize, from: u64, below: u16) {
         self.from[i] = from.min(u64::from(u16::MAX)) as u16;
         self.len[i] = below.saturating_sub(self.from[i]);
+        self.ends[i / BLOCK] = self.ends[i / BLOCK].max(below);
     }
 
     /// Returns whether the value counts.
@@ -641,9 +659,20 @@ impl Spans {
         self.len[i] > 0
     }
 
-    /// Returns the number of beams whose value counts.
-    fn count(&self, ranges: &[u16]) -> u16 {
-        let spans = self.from.iter().zip(&self.len);
-        spans.zip(ranges).map(|((&from, &len), &value)| u16::from(value.wrapping_sub(from) < len)).sum()
+    /// Returns the number of beams whose value counts. `shortest` are the shortest values of the blocks that may count.
+    /// In most rooms, those of most blocks are too long.
+    fn count(&self, ranges: &[u16], shortest: &[u16]) -> u16 {
+        let may_count = |&block: &usize| shortest[block] < self.ends[block];
+        let blocks = (0..ranges.len().div_ceil(BLOCK).min(self.ends.len())).filter(may_count);
+        blocks.map(|block| self.count_in(block, ranges)).sum()
+    }
+
+    /// Returns the number of beams of a block whose value counts.
+    #[inline(never)]
+    fn count_in(&self, block: usize, ranges: &[u16]) -> u16 {
+        let beams = block * BLOCK..ranges.len().min((block + 1) * BLOCK);
+        let spans = self.from[beams.clone()].iter().zip(&self.len[beams.clone()]);
+        let values = spans.zip(&ranges[beams]);
+        values.map(|((&from, &len), &value)| u16::from(value.wrapping_sub(from) < len)).sum()
     }
 }
