@@ -72,7 +72,7 @@ pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wai
         // The others do not wait for a subscriber that fails.
         all.wait();
         let mut scans = attached.map_err(|error| error.to_string())?;
-        let words = |failure: scanhub_schema::Failure| failure.to_string();
+        let words = |error: scanhub_client::Error| error.to_string();
         // Samples that queued up, or were missed, while others attached do not count.
         while scans.try_next().map_err(words)?.is_some() {}
         let end = clock::now() + seconds * 1_000_000_000;

@@ -160,7 +160,7 @@ pub(crate) fn stay(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     for _ in 0..count {
         let mut consumer = subscribe::<Scan>(domain, sensor)?.timeout(PATIENCE);
         if let Err(failure) = consumer.next() {
-            println!("refused {} {}", consumers.len(), failure.message);
+            println!("refused {} {}", consumers.len(), failure.message());
             break;
         }
         consumers.push(consumer);

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use scanhub_client::{Failure, Scan, subscribe};
+use scanhub_client::{Error, Scan, subscribe};
 
-fn main() -> Result<(), Failure> {
+fn main() -> Result<(), Error> {
     let mut scans = subscribe::<Scan>("front")?.timeout(Duration::from_millis(500));
     loop {
         let Some(scan) = scans.next()? else {

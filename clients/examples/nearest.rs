@@ -1,8 +1,8 @@
 //! The nearest beam of every scan: `cargo run --example nearest front`.
 
-use scanhub_client::{Failure, Scan, subscribe};
+use scanhub_client::{Error, Scan, subscribe};
 
-fn main() -> Result<(), Failure> {
+fn main() -> Result<(), Error> {
     let sensor = std::env::args().nth(1).unwrap_or_else(|| "front".into());
     let mut scans = subscribe::<Scan>(&sensor)?;
     while let Some(scan) = scans.next()? {

@@ -1,8 +1,8 @@
 //! Whether the robot may go, said when it changes: `cargo run --example stop`.
 
-use scanhub_client::{Failure, robot};
+use scanhub_client::{Error, robot};
 
-fn main() -> Result<(), Failure> {
+fn main() -> Result<(), Error> {
     let mut robot = robot(&[])?;
     let mut last = None;
     loop {

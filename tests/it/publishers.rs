@@ -4,9 +4,9 @@
 use std::io::{PipeWriter, Write};
 use std::process::Command;
 
-use scanhub_client::{PublishSession, Subscription, clock};
+use scanhub_client::{ErrorKind, PublishSession, Subscription, clock};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Kind, Maker, Quality, Tilt, Topic};
+use scanhub_schema::{Maker, Quality, Tilt, Topic};
 use scanhub_shm::Bell;
 
 use crate::client_c::installed::{Installed, source};
@@ -147,7 +147,10 @@ fn a_name_has_one_publisher_in_all_languages() {
             );
         }
         let failure = beside().map(drop).expect_err("it is taken");
-        assert_eq!((failure.kind, failure.to_string()), (Kind::NameHeld, refused(mount.program.pid())));
+        assert_eq!(
+            (failure.kind(), failure.to_string()),
+            (ErrorKind::NameHeld, refused(mount.program.pid()))
+        );
         assert_eq!(mount.end().code, Some(0));
         // It is free at once.
         let in_rust = beside().expect("the name is free");

@@ -101,14 +101,21 @@ impl Cli {
         let ros2 = self.ros2.then(|| self.ros2(&environment, !sends)).transpose()?;
         let send = sends.then(|| {
             let places = Domain::candidates(&self.domain, self.root.as_deref(), &environment)?;
-            Ok(SendOptions { topics: self.topics.clone(), places })
+            Ok::<_, Failure>(SendOptions { topics: self.topics.clone(), places })
         });
         let publish = self.publish.then(|| {
             let domain = publisher_domain(&self.domain, self.root.as_deref(), &environment)?;
             let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
             let topics = received_topics(&self.topics)?;
             let memory = u64::from(self.memory) << 20;
-            Ok(PublishOptions { domain, topics, names: self.names, hubs: self.hubs, limits, memory })
+            Ok::<_, Failure>(PublishOptions {
+                domain,
+                topics,
+                names: self.names,
+                hubs: self.hubs,
+                limits,
+                memory,
+            })
         });
         Ok(BridgeOptions {
             connect: self.connect,

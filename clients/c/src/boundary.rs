@@ -7,7 +7,8 @@ use std::ffi::{CStr, CString, c_char, c_int, c_void};
 use std::mem::MaybeUninit;
 use std::ptr;
 
-use scanhub_schema::{Failure, Header, Kind};
+use scanhub_client::{Error, ErrorKind};
+use scanhub_schema::Header;
 
 use crate::handle::Opaque;
 
@@ -92,8 +93,8 @@ const NULL: CallError = CallError::Argument("an argument is NULL", "give the add
 pub(crate) enum CallError {
     /// An invalid argument, and the remedy.
     Argument(&'static str, &'static str),
-    /// A failure of the client library.
-    Failure(Failure),
+    /// An error of the client library.
+    Client(Error),
     /// A panic. Its message is on stderr.
     Bug,
 }
@@ -103,9 +104,9 @@ impl CallError {
     fn number(&self) -> c_int {
         match self {
             CallError::Argument(..) => -1,
-            CallError::Failure(failure) => match failure.kind {
-                Kind::Configuration => -2,
-                Kind::Short => -3,
+            CallError::Client(error) => match error.kind() {
+                ErrorKind::InvalidInput => -2,
+                ErrorKind::ResourceExhausted => -3,
                 _ => -4,
             },
             CallError::Bug => -5,
@@ -116,7 +117,7 @@ impl CallError {
     pub(crate) fn keep(&self) -> c_int {
         let message = match self {
             CallError::Argument(what, hint) => format!("{what}\n  {hint}"),
-            CallError::Failure(failure) => failure.to_string(),
+            CallError::Client(error) => error.to_string(),
             CallError::Bug => "a bug in this library\n  stderr shows where; please report it".to_owned(),
         };
         // Messages are printable, so they contain no 0.
@@ -127,9 +128,9 @@ impl CallError {
     }
 }
 
-impl From<Failure> for CallError {
-    fn from(failure: Failure) -> CallError {
-        CallError::Failure(failure)
+impl From<Error> for CallError {
+    fn from(error: Error) -> CallError {
+        CallError::Client(error)
     }
 }
 

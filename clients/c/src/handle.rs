@@ -16,10 +16,10 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Domain, Heard, Payload, Publication, Received, Robot, RobotFollower, Subscription, Wait, ZonesFollower,
-    home,
+    Domain, Error, Heard, Payload, Publication, Received, Robot, RobotFollower, Subscription, Wait,
+    ZonesFollower, home,
 };
-use scanhub_schema::{Failure, Header, Tilt, Topic, limits};
+use scanhub_schema::{Header, Tilt, Topic, limits};
 
 use crate::boundary::{CallError, Lent};
 
@@ -63,7 +63,7 @@ macro_rules! topics {
         enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }
 
         impl Source {
-            fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Failure> {
+            fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Error> {
                 Ok(match topic {
                     $(Topic::$topic => {
                         Source::$topic(<follower!($topic $payload)>::in_domain(places, sensor)?.wait_by(wait))
@@ -71,21 +71,21 @@ macro_rules! topics {
                 })
             }
 
-            fn try_next(&mut self) -> Result<Option<Held>, Failure> {
+            fn try_next(&mut self) -> Result<Option<Held>, Error> {
                 Ok(match self {
                     Source::Robot(robot) => robot.try_next()?.map(Told::new).map(Held::Robot),
                     $(Source::$topic(topic) => topic.try_next()?.map(Held::$topic),)*
                 })
             }
 
-            fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+            fn wait(&mut self, longest: Duration) -> Result<(), Error> {
                 match self {
                     Source::Robot(robot) => robot.wait(longest),
                     $(Source::$topic(topic) => topic.wait(longest),)*
                 }
             }
 
-            fn descriptor(&mut self) -> Result<c_int, Failure> {
+            fn descriptor(&mut self) -> Result<c_int, Error> {
                 Ok(match self {
                     Source::Robot(robot) => robot.descriptor()?,
                     $(Source::$topic(topic) => topic.descriptor()?,)*

@@ -4,10 +4,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Kind, Request, Shown};
+use scanhub_schema::{Kind, Request, Shown};
 use scanhub_shm::{ControlClient, Node};
 use scanhub_shm::{Domain, holder};
 
+use crate::error::Error;
 use crate::presence::{GRACE, find};
 
 /// Sends `request` to the hub at the first of `places` where one runs, and returns its answer.
@@ -17,9 +18,9 @@ use crate::presence::{GRACE, find};
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
 ///
-/// use scanhub_client::{Failure, Request, Verb, places, request};
+/// use scanhub_client::{Error, Request, Verb, places, request};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     // Set by a signal, for example.
 ///     let stop = AtomicBool::new(false);
 ///     request(&places(None)?, &Request::new("front", Verb::Reset), &stop)?;
@@ -29,25 +30,25 @@ use crate::presence::{GRACE, find};
 ///
 /// # Errors
 ///
-/// [`Kind::NoHub`] within a second if there is none, or if it ends before it answers; [`Kind::NoTopic`] with the sensors
-/// that exist; [`Kind::Short`] if there are too many requests at a time; [`Kind::Failed`] if the link cannot do it;
-/// [`Kind::Timeout`] if the hub does not answer: it is short of something, or the link is busy;
-/// [`Kind::Interrupted`] if `stop` is set.
-pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Failure> {
+/// [`ErrorKind::NoHub`](crate::ErrorKind) within a second if there is none, or if it ends before it answers; [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors
+/// that exist; [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time; [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it;
+/// [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not answer: it is short of something, or the link is busy;
+/// [`ErrorKind::Interrupted`](crate::ErrorKind) if `stop` is set.
+pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Error> {
     let domain = find(places)?;
     let node = scanhub_shm::client_node(&domain)?;
     ask(&open(&node)?, &domain, request, stop)
 }
 
 /// The control service; waits for the service of a hub that is just starting.
-fn open(node: &Node) -> Result<ControlClient, Failure> {
+fn open(node: &Node) -> Result<ControlClient, Error> {
     let give_up_at = Instant::now() + GRACE;
     loop {
         if let Some(client) = ControlClient::open(node)? {
             return Ok(client);
         }
         if Instant::now() >= give_up_at {
-            return Err(Failure::new(Kind::NoHub, "the hub takes no requests", "it may be an older one"));
+            return Err(Error::new(Kind::NoHub, "the hub takes no requests", "it may be an older one"));
         }
         sleep(ASK_AGAIN);
     }
@@ -58,7 +59,7 @@ fn ask(
     domain: &Domain,
     request: &Request,
     stop: &AtomicBool,
-) -> Result<Option<Shown>, Failure> {
+) -> Result<Option<Shown>, Error> {
     let pending = client.ask(request)?;
     let give_up_at = Instant::now() + PATIENCE;
     loop {
@@ -66,14 +67,14 @@ fn ask(
         // In this order: what was answered before the hub went is an answer.
         let lives = pending.is_open() && holder(domain.root())?.is_some();
         if let Some(response) = pending.response()? {
-            return response.0;
+            return Ok(response.0?);
         }
         if !lives {
             let hint = "the result is not known: `scanhub info` shows the sensor's state";
-            return Err(Failure::new(Kind::NoHub, "the hub went away before it answered", hint));
+            return Err(Error::new(Kind::NoHub, "the hub went away before it answered", hint));
         }
         if stop.load(Ordering::Relaxed) {
-            return Err(Failure::new(Kind::Interrupted, "interrupted before the hub answered", ""));
+            return Err(Error::new(Kind::Interrupted, "interrupted before the hub answered", ""));
         }
         if Instant::now() >= give_up_at {
             let message =
@@ -82,7 +83,7 @@ fn ask(
                 "its log says whether something is short; `scanhub info {}` shows its state",
                 request.sensor
             );
-            return Err(Failure::new(Kind::Timeout, message, hint));
+            return Err(Error::new(Kind::Timeout, message, hint));
         }
         scanhub_shm::sleep(&[client.responses()], LOOK_EVERY)?;
     }

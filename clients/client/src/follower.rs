@@ -4,9 +4,10 @@
 use std::ops::Deref;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Flags, Header, Kind, Scan};
+use scanhub_schema::{Flags, Header, Kind, Scan};
 use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
 
+use crate::error::Error;
 use crate::session::Session;
 
 /// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four at a time, and none
@@ -82,9 +83,10 @@ impl<P: Payload + ?Sized> Follower<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if descriptors or memory are short, [`Kind::Failed`] if more than four samples are held or the
-    /// topic has another layout.
-    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Failure> {
+    /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived,
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors or memory are short,
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic has another layout.
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
         if !self.subscribe(session)? {
             return Ok(None);
         }
@@ -101,11 +103,7 @@ impl<P: Payload + ?Sized> Follower<P> {
                 self.nothing_at = moment.filter(|_| sample.is_none());
                 Ok(sample.map(|sample| self.account(sample)))
             }
-            Err(ReceiveError::ExceedsMaxBorrows) => Err(Failure::new(
-                Kind::Failed,
-                "more than four samples are held",
-                "drop them before the next one",
-            )),
+            Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),
             // Occurs while the memory of a killed hub is being removed. If it persists, it is a shortage.
             Err(ReceiveError::ConnectionFailure(error)) => {
                 let since = *self.unconnected_since.get_or_insert_with(Instant::now);
@@ -113,12 +111,12 @@ impl<P: Payload + ?Sized> Follower<P> {
                     return Ok(None);
                 }
                 let what = format!("cannot connect to {}/{}: {error:?}", self.sensor, P::TOPIC.name());
-                Err(Failure::new(Kind::Short, what, "`ulimit -n` or /dev/shm may be too small"))
+                Err(Error::new(Kind::Short, what, "`ulimit -n` or /dev/shm may be too small"))
             }
         }
     }
 
-    fn subscribe(&mut self, session: &mut Session) -> Result<bool, Failure> {
+    fn subscribe(&mut self, session: &mut Session) -> Result<bool, Error> {
         if self.port.as_ref().is_some_and(|(number, _)| *number == session.number()) {
             return Ok(true);
         }

@@ -14,9 +14,9 @@
 //! # Examples
 //!
 //! ```no_run
-//! use scanhub_client::{Failure, Scan, subscribe};
+//! use scanhub_client::{Error, Scan, subscribe};
 //!
-//! fn main() -> Result<(), Failure> {
+//! fn main() -> Result<(), Error> {
 //!     let mut scans = subscribe::<Scan>("front")?;
 //!     while let Some(scan) = scans.next()? {
 //!         let distances = (0..scan.beams()).filter_map(|i| Some((scan.distance_mm(i)?, i)));
@@ -30,6 +30,7 @@
 
 pub mod clock;
 mod control;
+mod error;
 mod follower;
 mod join;
 mod presence;
@@ -42,6 +43,7 @@ mod wait;
 mod zones;
 
 pub use control::request;
+pub use error::{Cause, Error, ErrorKind};
 pub use follower::Received;
 pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, home, publish};
@@ -52,10 +54,33 @@ pub use zones::{Heard, ZonesFollower, zones};
 
 /// Types of topics and payloads, so that a program needs no other dependency.
 pub use scanhub_schema::{
-    Age, Failure, Flags, Header, Kind, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake,
-    payloads::*,
+    Age, Flags, Header, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake, payloads::*,
 };
-pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
+pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
+
+/// Payload of a topic: `[u8]` (telegrams), or a type of this crate such as [`Scan`]. Other crates cannot implement it.
+///
+/// ```compile_fail,E0277
+/// #[derive(Debug)]
+/// struct Mine;
+/// impl scanhub_client::Payload for Mine {
+///     const TOPIC: scanhub_client::Topic = scanhub_client::Topic::Scan;
+/// }
+/// ```
+///
+/// ```
+/// use scanhub_client::{Payload, Scan, Topic};
+///
+/// assert_eq!(Scan::TOPIC, Topic::Scan);
+/// ```
+pub trait Payload: scanhub_shm::Payload {
+    /// Topic of this payload.
+    const TOPIC: Topic;
+}
+
+impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
+    const TOPIC: Topic = <P as scanhub_shm::Payload>::TOPIC;
+}
 
 /// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for
 /// programs that need more than a [`Subscription`].
@@ -64,9 +89,9 @@ pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 ///
 /// ```no_run
 /// use scanhub_client::streams::{Session, Source};
-/// use scanhub_client::{Failure, Topic, places};
+/// use scanhub_client::{Error, Topic, places};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     let mut session = Session::new(places(None)?);
 ///     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
 ///     loop {

@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Domain, Environment, RunningHub, holder, publisher};
 
+use crate::error::Error;
+
 /// Interval of the queries of the locks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
@@ -198,8 +200,8 @@ fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], call
 ///
 /// # Errors
 ///
-/// [`Kind::NoHub`] after half a second.
-pub fn find(places: &[Domain]) -> Result<Domain, Failure> {
+/// [`ErrorKind::NoHub`](crate::ErrorKind) after half a second.
+pub fn find(places: &[Domain]) -> Result<Domain, Error> {
     let give_up_at = Instant::now() + GRACE;
     let mut presence = Presence::new(places.to_vec());
     loop {
@@ -208,7 +210,7 @@ pub fn find(places: &[Domain]) -> Result<Domain, Failure> {
             return Ok(domain.clone());
         }
         if Instant::now() >= give_up_at {
-            return Err(presence.no_hub());
+            return Err(presence.no_hub().into());
         }
         std::thread::sleep(LOOK_EVERY);
     }
@@ -227,7 +229,7 @@ pub const GRACE: Duration = Duration::from_millis(500);
 ///
 /// let places = places(Some("no-hub-is-here"))?;
 /// assert!(live_sensors(&places).is_empty());
-/// # Ok::<(), scanhub_client::Failure>(())
+/// # Ok::<(), scanhub_client::Error>(())
 /// ```
 pub fn live_sensors(places: &[Domain]) -> Vec<String> {
     live(places, scanhub_shm::sensors)

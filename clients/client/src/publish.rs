@@ -6,9 +6,7 @@ use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{
-    Failure, Header, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote,
-};
+use scanhub_schema::{Header, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
 use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use scanhub_shm::{
     DEFAULT_DOMAIN, Domain, DueRings, Environment, ListenLock, NameLock, Payload, Role, SharedMemory,
@@ -16,6 +14,7 @@ use scanhub_shm::{
 };
 
 use crate::clock;
+use crate::error::Error;
 
 type Node = scanhub_shm::Node<ThreadSafeService>;
 type Waker = scanhub_shm::Waker<ThreadSafeService>;
@@ -38,9 +37,9 @@ type Waker = scanhub_shm::Waker<ThreadSafeService>;
 /// # Examples
 ///
 /// ```no_run
-/// use scanhub_client::{Failure, Marks, publish, subscribe};
+/// use scanhub_client::{Error, Marks, publish, subscribe};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     let mut near = publish::<Marks>("tracker.near")?;
 ///     let mut marks = subscribe::<Marks>("front")?;
 ///     while let Some(seen) = marks.next()? {
@@ -49,7 +48,7 @@ type Waker = scanhub_shm::Waker<ThreadSafeService>;
 ///     Ok(())
 /// }
 /// ```
-pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
+pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Error> {
     Publication::in_domain(&home(None)?, name)
 }
 
@@ -58,11 +57,11 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failur
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible.
-pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible.
+pub fn home(domain: Option<&str>) -> Result<Domain, Error> {
     let of_process = std::env::var("SCANHUB_DOMAIN");
     let name = domain.unwrap_or(of_process.as_deref().unwrap_or(DEFAULT_DOMAIN));
-    publisher_domain(name, None, &Environment::of_process())
+    Ok(publisher_domain(name, None, &Environment::of_process())?)
 }
 
 /// Membership of a publishing process in a domain. It ends when the session and every publisher created from it are
@@ -89,8 +88,8 @@ enum Place {
 }
 
 /// Checks that there is memory for `topics` of one sensor.
-fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Failure> {
-    check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))
+fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Error> {
+    Ok(check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))?)
 }
 
 /// Descriptors of a service, and of its first subscriber.
@@ -103,11 +102,11 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if another process, or another session of this one, holds the lock.
-    /// The message has its process ID. [`Kind::Configuration`](scanhub_schema::Kind) if the limits are invalid;
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind)
+    /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if another process, or another session of this one, holds the lock.
+    /// The message has its process ID. [`ErrorKind::InvalidInput`](crate::ErrorKind) if the limits are invalid;
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind)
     /// if the directory is another user's.
-    pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
+    pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Error> {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
@@ -120,8 +119,8 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`](scanhub_schema::Kind) if another process publishes as `name`: a program, or the hub
-    /// whose sensor it is. The message names the process. Returns [`Kind::Configuration`](scanhub_schema::Kind) if the
+    /// Returns [`ErrorKind::NameHeld`](crate::ErrorKind) if another process publishes as `name`: a program, or the hub
+    /// whose sensor it is. The message names the process. Returns [`ErrorKind::InvalidInput`](crate::ErrorKind) if the
     /// name is invalid, or if subscribers still wait for a sensor of this name after its hub has ended. Otherwise the
     /// errors of [`open`](Self::open) and [`sensor`](Self::sensor).
     pub fn beside(
@@ -129,7 +128,7 @@ impl PublishSession {
         name: &str,
         topics: &[Topic],
         limits: TopicLimits,
-    ) -> Result<SensorPublisher, Failure> {
+    ) -> Result<SensorPublisher, Error> {
         limits.check()?;
         check_sensor(name)?;
         let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
@@ -138,10 +137,10 @@ impl PublishSession {
         if scanhub_shm::published(domain)?.iter().any(of_hub) {
             // A hub that is starting, or that has waited for this name, takes it now.
             if let Some(pid) = holder(domain.root())? {
-                return Err(name_held(name, pid));
+                return Err(name_held(name, pid).into());
             }
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
-            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
+            return Err(Error::new(Kind::Configuration, what, "any other name, for example house"));
         }
         PublishSession::with(domain, limits, scanhub_shm::join(domain, Role::Publisher)?, lock).sensor(name)
     }
@@ -162,10 +161,10 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) with what is free and what is needed.
-    pub fn check_room(&self, topics: &[Topic]) -> Result<(), Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) with what is free and what is needed.
+    pub fn check_room(&self, topics: &[Topic]) -> Result<(), Error> {
         check_topics(topics, &self.0.limits)?;
-        check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)
+        Ok(check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)?)
     }
 
     /// Creates the publisher of the topics of `name`, which is `OWNER.NAME`. Sensors of a hub have no dot in their
@@ -174,15 +173,15 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible; [`Kind::Short`](scanhub_schema::Kind)
-    /// if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind) if the place is taken by another
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible; [`ErrorKind::ResourceExhausted`](crate::ErrorKind)
+    /// if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind) if the place is taken by another
     /// user.
-    pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
+    pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Error> {
         check_followed(name)?;
         let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
         if !is_own && !is_remote(name) {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
-            return Err(Failure::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
+            return Err(Error::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
         let mut sensors = locked(&self.0.sensors);
         sensors.retain(|sensor| sensor.strong_count() > 0);
@@ -219,11 +218,11 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](scanhub_schema::Kind) if this process publishes it already;
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if only sensors have the topic, and the name has no dot;
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short; [`Kind::Failed`](scanhub_schema::Kind)
+    /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if this process publishes it already;
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if only sensors have the topic, and the name has no dot;
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind)
     /// if the topic exists with another layout.
-    pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
+    pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Error> {
         self.topic_for(self.limits())
     }
 
@@ -232,12 +231,12 @@ impl SensorPublisher {
     /// # Errors
     ///
     /// As [`topic`](Self::topic).
-    pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Failure> {
+    pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Error> {
         let Membership { domain, node, .. } = &*self.0.membership;
         if P::TOPIC.maker() == Maker::Link && !is_remote(&self.0.name) {
             let what =
                 format!("only sensors have the topic {}, and {} is not one", P::TOPIC.name(), self.0.name);
-            return Err(Failure::new(
+            return Err(Error::new(
                 Kind::Configuration,
                 what,
                 "publish it as OWNER.NAME, for example tracker.near",
@@ -261,11 +260,11 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`](scanhub_schema::Kind) if some were not woken; these look by themselves ten times a second.
-    pub fn wake(&self, why: Wake) -> Result<(), Failure> {
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if some were not woken; these look by themselves ten times a second.
+    pub fn wake(&self, why: Wake) -> Result<(), Error> {
         let mut due = std::mem::take(&mut *locked(&self.0.due));
         Ring::ALL.into_iter().filter(|&ring| due.take(ring)).for_each(|ring| self.0.waker.ring(ring));
-        self.0.waker.tell(why)
+        Ok(self.0.waker.tell(why)?)
     }
 
     /// Notes that `reached` subscribers have received a sample of `topic`.
@@ -287,7 +286,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     /// # Errors
     ///
     /// As [`publish`](crate::publish).
-    pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Failure> {
+    pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Error> {
         let (topics, limits) = ([P::TOPIC], TopicLimits::default());
         if P::TOPIC.maker() == Maker::Link {
             return PublishSession::open(domain, &topics, limits)?.sensor(name)?.topic();
@@ -359,9 +358,9 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) if it is longer than the topic was
+    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if it is longer than the topic was
     /// made for.
-    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_len_with(&header, len, fill)?;
         self.sensor.wake(Wake::Telegram)
@@ -372,15 +371,17 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than the topic was made for:
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than the topic was made for:
     /// its number is used up.
     pub fn send_len_with(
         &mut self,
         header: &Header,
         len: usize,
         fill: impl FnOnce(&mut P),
-    ) -> Result<usize, Failure> {
-        self.topic.send_len(header, len, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
+    ) -> Result<usize, Error> {
+        let reached = self.topic.send_len(header, len, fill)?;
+        self.sensor.note(P::TOPIC, reached);
+        Ok(reached)
     }
 }
 
@@ -389,9 +390,9 @@ impl<P: Payload> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up. Else as
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it: its number is used up. Else as
     /// [`SensorPublisher::wake`].
-    pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+    pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_with(&header, fill)?;
         self.sensor.wake(Wake::Telegram)
@@ -403,7 +404,7 @@ impl<P: Payload> Publication<P> {
     /// # Errors
     ///
     /// As [`send`](Self::send).
-    pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+    pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header_at(stamp_ns);
         self.send_with(&header, fill)?;
         self.sensor.wake(Wake::Telegram)
@@ -415,9 +416,11 @@ impl<P: Payload> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it: its number is used up.
-    pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it: its number is used up.
+    pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Error> {
+        let reached = self.topic.send(header, fill)?;
+        self.sensor.note(P::TOPIC, reached);
+        Ok(reached)
     }
 }
 
@@ -426,9 +429,9 @@ impl Publication<[u8]> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](scanhub_schema::Kind) for more than
+    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) for more than
     /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
-    pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Failure> {
+    pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Error> {
         let header = self.header();
         self.send_bytes_with(&header, bytes)?;
         self.sensor.wake(Wake::Telegram)
@@ -438,10 +441,12 @@ impl Publication<[u8]> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if there is no memory for it, or it is longer than
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than
     /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX).
-    pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
+    pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Error> {
+        let reached = self.topic.send_bytes(header, bytes)?;
+        self.sensor.note(Topic::Telegram, reached);
+        Ok(reached)
     }
 }
 

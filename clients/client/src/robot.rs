@@ -3,10 +3,11 @@
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, Verdict, Zones, check_followed, is_remote};
+use scanhub_schema::{Verdict, Zones, check_followed, is_remote};
 use scanhub_shm::Domain;
 
 use crate::clock;
+use crate::error::Error;
 use crate::presence::{GRACE, Who};
 use crate::session::Session;
 use crate::subscribe::places;
@@ -19,9 +20,9 @@ use crate::zones::{Freshness, Heard, ZonesSource};
 /// # Examples
 ///
 /// ```no_run
-/// use scanhub_client::{Failure, robot};
+/// use scanhub_client::{Error, robot};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     let mut robot = robot(&[])?;
 ///     loop {
 ///         let now = robot.next()?;
@@ -32,8 +33,8 @@ use crate::zones::{Freshness, Heard, ZonesSource};
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
-pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Failure> {
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
+pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Error> {
     RobotFollower::in_domain(places(None)?, sensors)
 }
 
@@ -100,8 +101,8 @@ impl RobotFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if a sensor's name is not possible.
-    pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Failure> {
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Error> {
         sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
         Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
     }
@@ -125,7 +126,7 @@ impl RobotFollower {
     ///
     /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
-    pub fn next(&mut self) -> Result<&Robot, Failure> {
+    pub fn next(&mut self) -> Result<&Robot, Error> {
         while !self.hear()? {
             self.wait(Duration::MAX)?;
         }
@@ -137,7 +138,7 @@ impl RobotFollower {
     /// # Errors
     ///
     /// As [`next`](Self::next).
-    pub fn now(&mut self) -> Result<&Robot, Failure> {
+    pub fn now(&mut self) -> Result<&Robot, Error> {
         self.hear()?;
         Ok(self.source.robot())
     }
@@ -147,7 +148,7 @@ impl RobotFollower {
     /// # Errors
     ///
     /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<&Robot>, Failure> {
+    pub fn try_next(&mut self) -> Result<Option<&Robot>, Error> {
         loop {
             if self.hear()? {
                 return Ok(Some(self.source.robot()));
@@ -162,8 +163,8 @@ impl RobotFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
@@ -172,7 +173,7 @@ impl RobotFollower {
     /// # Errors
     ///
     /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         self.session.descriptor()
     }
 
@@ -183,7 +184,7 @@ impl RobotFollower {
     }
 
     /// Takes all samples that have arrived. Returns whether there were any.
-    fn hear(&mut self) -> Result<bool, Failure> {
+    fn hear(&mut self) -> Result<bool, Error> {
         // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
         // notice a new hub.
         let heard = self.source.drain(&mut self.session)?;
@@ -282,7 +283,7 @@ impl RobotSource {
     /// # Errors
     ///
     /// As [`ZonesSource::receive`].
-    pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Failure> {
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Error> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
     }
@@ -300,7 +301,7 @@ impl RobotSource {
     /// # Errors
     ///
     /// As [`ZonesSource::receive`].
-    pub fn drain(&mut self, session: &mut Session) -> Result<bool, Failure> {
+    pub fn drain(&mut self, session: &mut Session) -> Result<bool, Error> {
         let mut any = false;
         while self.hear(session)?.is_some() {
             any = true;
@@ -308,7 +309,7 @@ impl RobotSource {
         Ok(any)
     }
 
-    fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+    fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
         if self.gives_way_to(session.publishes()) {
             return Ok(Some(Heard::nothing()));
         }
@@ -342,7 +343,7 @@ impl RobotSource {
 
     /// Adds the sensors that exist and are not followed yet. Sensors that no longer exist stay, so that the user sees
     /// that they are missing.
-    fn discover(&mut self, session: &Session) -> Result<(), Failure> {
+    fn discover(&mut self, session: &Session) -> Result<(), Error> {
         let (Whose::All(whose), Some(domain)) = (self.whose, session.domain()) else {
             self.call_at = None;
             return Ok(());

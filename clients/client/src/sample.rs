@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use bytemuck::bytes_of;
 use scanhub_schema::datagram::Packed;
-use scanhub_schema::{Failure, Header, ROBOT, Topic};
+use scanhub_schema::{Header, ROBOT, Topic};
 use scanhub_shm::Payload;
 
+use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
@@ -80,7 +81,7 @@ macro_rules! samples {
             /// # Errors
             ///
             /// As [`Follower::receive`].
-            pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Failure> {
+            pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Error> {
                 Ok(match self {
                     $(Source::$topic(source) => source.receive(session)?.map(Sample::$topic),)*
                     Source::Robot(source) => source.receive(session)?.map(Sample::Robot),

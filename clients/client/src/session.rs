@@ -1,6 +1,7 @@
 //! Membership of a process in a domain, across restarts of its hub. It wakes the process when samples arrive, and
 //! reports that a hub has started or ended.
 
+use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
@@ -9,9 +10,10 @@ use rustix::io::Errno;
 use rustix::time::{
     Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create, timerfd_settime,
 };
-use scanhub_schema::{Failure, Kind, Topic};
+use scanhub_schema::{Kind, Topic};
 use scanhub_shm::{Domain, Node, Payload, Role, Subscriber, ThreadSafeService, holder, is_starting};
 
+use crate::error::Error;
 use crate::presence::{Change, Presence, Who};
 use crate::wait::{Wait, Wakeups};
 
@@ -63,9 +65,9 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if memory or descriptors are short. A session that has joined already
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short. A session that has joined already
     /// continues without this check.
-    pub fn look(&mut self) -> Result<Change, Failure> {
+    pub fn look(&mut self) -> Result<Change, Error> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
         }
@@ -75,7 +77,7 @@ impl Session {
         }
         let Some(domain) = self.presence.domain() else {
             return match self.presence.short() {
-                Some(short) if self.joined.is_none() => Err(short),
+                Some(short) if self.joined.is_none() => Err(short.into()),
                 _ => Ok(change),
             };
         };
@@ -96,7 +98,7 @@ impl Session {
                 }
                 // It is just starting or ending: the next look decides.
                 Err(failure) if failure.kind == Kind::NoHub => return Ok(change),
-                Err(failure) => return Err(failure),
+                Err(failure) => return Err(failure.into()),
             },
         }
         self.is_unsure = false;
@@ -124,13 +126,13 @@ impl Session {
     }
 
     /// Returns the failure for callers that cannot wait for a hub.
-    pub fn no_hub(&self) -> Failure {
-        self.presence.no_hub()
+    pub fn no_hub(&self) -> Error {
+        self.presence.no_hub().into()
     }
 
     /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
-    pub fn no_hub_here(&self) -> Failure {
-        self.presence.no_hub_here()
+    pub fn no_hub_here(&self) -> Error {
+        self.presence.no_hub_here().into()
     }
 
     /// Counts the domains joined: ports of an earlier one must be opened again.
@@ -143,12 +145,12 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if memory, descriptors or places for subscribers are short; [`Kind::Failed`] if the topic has
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers are short; [`ErrorKind::Failed`](crate::ErrorKind) if the topic has
     /// another layout.
     pub fn subscribe<P: Payload + ?Sized>(
         &mut self,
         sensor: &str,
-    ) -> Result<Option<Subscriber<P, ThreadSafeService>>, Failure> {
+    ) -> Result<Option<Subscriber<P, ThreadSafeService>>, Error> {
         let (Some(_), Some(joined)) = (self.presence.domain(), &mut self.joined) else {
             return Ok(None);
         };
@@ -177,11 +179,11 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`] if the session does not wait by event, [`Kind::Short`] if descriptors are short.
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the session does not wait by event, [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors are short.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         if self.wait != Wait::Event {
             let hint = "make it wait by event: a bell has no descriptor";
-            return Err(Failure::new(Kind::Configuration, "no descriptor to wait on", hint));
+            return Err(Error::new(Kind::Configuration, "no descriptor to wait on", hint));
         }
         let readiness: &Readiness = match &mut self.readiness {
             Some(readiness) => readiness,
@@ -202,15 +204,15 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if the system cannot wait.
-    pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Error> {
         let Some(readiness) = &self.readiness else { return Ok(false) };
         // The hub sends samples to late joiners without an event.
         let is_settled = self.subscribed_at.is_some_and(|at| at.elapsed() >= MAKE_SURE_EVERY);
         let pace =
             if is_settled && self.presence.domain().is_some() { MAKE_SURE_EVERY } else { LONGEST_WAIT };
         readiness.again_in(left.map_or(pace, |left| left.min(pace)))?;
-        self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())
+        Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
     }
 
     /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if one may have been sent
@@ -218,8 +220,8 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if the system cannot wait.
-    pub fn wait(&mut self, until: Option<Instant>) -> Result<(), Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn wait(&mut self, until: Option<Instant>) -> Result<(), Error> {
         self.wait_for(until.map(|until| until.saturating_duration_since(Instant::now())))
     }
 
@@ -228,7 +230,7 @@ impl Session {
     /// # Errors
     ///
     /// As [`wait`](Self::wait).
-    pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Failure> {
+    pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Error> {
         let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
         // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
         // settled.
@@ -236,7 +238,7 @@ impl Session {
             readiness.again_in(Duration::ZERO)?;
         }
         match &mut self.joined {
-            Some(joined) => joined.wakeups.wait(&joined.node, left),
+            Some(joined) => Ok(joined.wakeups.wait(&joined.node, left)?),
             None => {
                 std::thread::sleep(left);
                 Ok(())
@@ -253,8 +255,8 @@ struct Readiness {
 }
 
 impl Readiness {
-    /// Creates a descriptor that is readable at once. Fails with [`Kind::Short`] without free descriptors.
-    fn new() -> Result<Readiness, Failure> {
+    /// Creates a descriptor that is readable at once. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free descriptors.
+    fn new() -> Result<Readiness, Error> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
         let descriptor = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?;
@@ -264,9 +266,9 @@ impl Readiness {
         Ok(readiness)
     }
 
-    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with [`Kind::Short`] without free
+    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free
     /// memory.
-    fn add(&self, event: BorrowedFd<'_>) -> Result<(), Failure> {
+    fn add(&self, event: BorrowedFd<'_>) -> Result<(), Error> {
         let data = epoll::EventData::new_u64(0);
         match epoll::add(&self.descriptor, event, data, epoll::EventFlags::IN) {
             Ok(()) | Err(Errno::EXIST) => Ok(()),
@@ -275,7 +277,7 @@ impl Readiness {
     }
 
     /// Sets the timer: it makes the descriptor readable after `left`.
-    fn again_in(&self, left: Duration) -> Result<(), Failure> {
+    fn again_in(&self, left: Duration) -> Result<(), Error> {
         // 0 would mean never.
         let left = left.max(Duration::from_nanos(1));
         let it_value = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
@@ -290,9 +292,9 @@ impl AsFd for Readiness {
     }
 }
 
-fn short(error: Errno) -> Failure {
+fn short(error: Errno) -> Error {
     let what = format!("no descriptor to wait on: {error}");
-    Failure::new(Kind::Short, what, "`ulimit -n` may be too small")
+    Error::new(Kind::Short, what, "`ulimit -n` may be too small").with_source(io::Error::from(error))
 }
 
 #[cfg(test)]
@@ -317,6 +319,14 @@ mod tests {
         assert!(!is_readable(&readiness, Duration::ZERO));
         readiness.again_in(Duration::from_millis(1)).unwrap();
         assert!(is_readable(&readiness, LONG));
+    }
+
+    #[test]
+    fn a_shortage_has_the_error_of_the_system_as_its_source() {
+        let error = short(Errno::MFILE);
+        assert_eq!(error.kind(), crate::ErrorKind::ResourceExhausted);
+        let source = std::error::Error::source(&error).and_then(|source| source.downcast_ref::<io::Error>());
+        assert_eq!(source.and_then(io::Error::raw_os_error), Some(Errno::MFILE.raw_os_error()));
     }
 
     #[test]

@@ -4,10 +4,11 @@
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Failure, check_followed};
+use scanhub_schema::check_followed;
 use scanhub_shm::Payload;
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
+use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::session::Session;
 use crate::wait::Wait;
@@ -18,9 +19,9 @@ use crate::wait::Wait;
 /// # Examples
 ///
 /// ```no_run
-/// use scanhub_client::{Failure, Scan, subscribe};
+/// use scanhub_client::{Error, Scan, subscribe};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     let mut scans = subscribe::<Scan>("front")?;
 ///     while let Some(scan) = scans.next()? {
 ///         println!("{} beams, beam 0 at {} degrees: {:?} mm", scan.beams(), scan.angle_deg(0), scan.distance_mm(0));
@@ -31,8 +32,8 @@ use crate::wait::Wait;
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
-pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Failure> {
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
+pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, Error> {
     Subscription::in_domain(places(None)?, sensor)
 }
 
@@ -40,14 +41,14 @@ pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscription<P>, F
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](scanhub_schema::Kind) if the name is not possible.
-pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Failure> {
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible.
+pub fn places(domain: Option<&str>) -> Result<Vec<Domain>, Error> {
     let environment = Environment::of_process();
     match domain {
-        Some(domain) => Domain::candidates(domain, None, &environment),
+        Some(domain) => Ok(Domain::candidates(domain, None, &environment)?),
         None => {
             let domain = std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
-            Domain::candidates(&domain, None, &environment)
+            Ok(Domain::candidates(&domain, None, &environment)?)
         }
     }
 }
@@ -64,8 +65,8 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if the sensor's name is not possible.
-    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Failure> {
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<Self, Error> {
         check_followed(sensor)?;
         Ok(Subscription { session: Session::new(places), follower: Follower::new(sensor), timeout: None })
     }
@@ -85,10 +86,10 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if descriptors or places are short, [`Kind::Failed`](scanhub_schema::Kind) if the domain
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors or places are short, [`ErrorKind::Failed`](crate::ErrorKind) if the domain
     /// is another user's or the topic has another layout.
     #[allow(clippy::should_implement_trait)] // An iterator would have to hold samples over waits.
-    pub fn next(&mut self) -> Result<Option<Received<P>>, Failure> {
+    pub fn next(&mut self) -> Result<Option<Received<P>>, Error> {
         // A timeout beyond all time is none.
         let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
@@ -107,7 +108,7 @@ impl<P: Payload + ?Sized> Subscription<P> {
     /// # Errors
     ///
     /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<Received<P>>, Failure> {
+    pub fn try_next(&mut self) -> Result<Option<Received<P>>, Error> {
         loop {
             if let Some(received) = self.look()? {
                 return Ok(Some(received));
@@ -123,8 +124,8 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(longest))
     }
 
@@ -135,12 +136,12 @@ impl<P: Payload + ?Sized> Subscription<P> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) without [`Wait::Event`], [`Kind::Short`](scanhub_schema::Kind) if descriptors are.
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) without [`Wait::Event`], [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors are.
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         self.session.descriptor()
     }
 
-    fn look(&mut self) -> Result<Option<Received<P>>, Failure> {
+    fn look(&mut self) -> Result<Option<Received<P>>, Error> {
         // What is there comes before the question whether the hub still is: that takes longer than receiving.
         if self.follower.subscribed()
             && let Some(received) = self.follower.receive(&mut self.session)?

@@ -5,10 +5,11 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use scanhub_schema::{Early, Failure, Flags, Header, Verdict, Zones, check_followed};
+use scanhub_schema::{Early, Flags, Header, Verdict, Zones, check_followed};
 use scanhub_shm::Domain;
 
 use crate::clock::{self, Moment};
+use crate::error::Error;
 use crate::follower::Follower;
 use crate::session::Session;
 use crate::subscribe::places;
@@ -19,9 +20,9 @@ use crate::wait::Wait;
 /// # Examples
 ///
 /// ```no_run
-/// use scanhub_client::{Failure, Verdict, zones};
+/// use scanhub_client::{Error, Verdict, zones};
 ///
-/// fn main() -> Result<(), Failure> {
+/// fn main() -> Result<(), Error> {
 ///     let mut front = zones("front")?;
 ///     loop {
 ///         let heard = front.next()?;
@@ -34,8 +35,8 @@ use crate::wait::Wait;
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`](scanhub_schema::Kind) if a name is not possible.
-pub fn zones(sensor: &str) -> Result<ZonesFollower, Failure> {
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
+pub fn zones(sensor: &str) -> Result<ZonesFollower, Error> {
     ZonesFollower::in_domain(places(None)?, sensor)
 }
 
@@ -72,8 +73,8 @@ impl ZonesFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](scanhub_schema::Kind) if the sensor's name is not possible.
-    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Failure> {
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the sensor's name is not possible.
+    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Error> {
         check_followed(sensor)?;
         Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
     }
@@ -91,7 +92,7 @@ impl ZonesFollower {
     ///
     /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
-    pub fn next(&mut self) -> Result<Heard, Failure> {
+    pub fn next(&mut self) -> Result<Heard, Error> {
         loop {
             if let Some(heard) = self.try_next()? {
                 return Ok(heard);
@@ -104,8 +105,8 @@ impl ZonesFollower {
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`](scanhub_schema::Kind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Failure> {
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
@@ -115,7 +116,7 @@ impl ZonesFollower {
     /// # Errors
     ///
     /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Failure> {
+    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         self.session.descriptor()
     }
 
@@ -130,7 +131,7 @@ impl ZonesFollower {
     /// # Errors
     ///
     /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<Heard>, Failure> {
+    pub fn try_next(&mut self) -> Result<Option<Heard>, Error> {
         loop {
             if let Some(heard) = self.look()? {
                 return Ok(Some(heard));
@@ -141,7 +142,7 @@ impl ZonesFollower {
         }
     }
 
-    fn look(&mut self) -> Result<Option<Heard>, Failure> {
+    fn look(&mut self) -> Result<Option<Heard>, Error> {
         // Samples that have arrived come first, because looking for the hub takes longer than receiving.
         if self.source.subscribed()
             && let Some(heard) = self.source.newest(&mut self.session)?
@@ -189,7 +190,7 @@ impl ZonesSource {
     /// # Errors
     ///
     /// As [`Follower::receive`].
-    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+    pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();
         let heard = match sample {
@@ -211,7 +212,7 @@ impl ZonesSource {
     }
 
     /// Returns the last of all samples that have arrived. The skipped ones count as missed.
-    fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
+    fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
         let mut newest: Option<Heard> = None;
         while let Some(mut heard) = self.receive(session)? {
             heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use scanhub_client::{Subscription, Wait, ZonesFollower};
-use scanhub_schema::{Kind, Scan, Status, Verdict};
+use scanhub_client::{ErrorKind, Subscription, Wait, ZonesFollower};
+use scanhub_schema::{Scan, Status, Verdict};
 use scanhub_shm::{PortFactory, UpdateConnections};
 
 /// Whether `descriptor` gets readable within `longest`.
@@ -45,8 +45,8 @@ fn a_bell_has_no_descriptor() {
     let place = Place::new();
     let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
     let failure = scans.descriptor().unwrap_err();
-    assert_eq!(failure.kind, Kind::Configuration);
-    assert!(failure.hint.contains("by event"), "{failure}");
+    assert_eq!(failure.kind(), ErrorKind::InvalidInput);
+    assert!(failure.remedy().contains("by event"), "{failure}");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::{
-    Event, Kind, Marks, PublishSession, Scan, Subscription, Topic, Tracks, Verdict, Wait, Wake, Zones,
+    ErrorKind, Event, Marks, PublishSession, Scan, Subscription, Topic, Tracks, Verdict, Wait, Wake, Zones,
 };
 use scanhub_schema::ScanHead;
 use scanhub_schema::limits::TopicLimits;
@@ -108,7 +108,7 @@ fn a_name_that_is_made_twice_wakes_its_consumers_all_the_same() {
     let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
     let zones = session.sensor("tracker.near").unwrap().topic::<Zones>().unwrap();
     let again = session.sensor("tracker.near").and_then(|sensor| sensor.topic::<Marks>()).map(drop);
-    assert_eq!(again.unwrap_err().kind, Kind::DomainHeld);
+    assert_eq!(again.unwrap_err().kind(), ErrorKind::DomainHeld);
     drop((session, zones));
     let mut followed = follow(&place, "tracker.near");
     assert!(followed.try_next().unwrap().is_none());
@@ -127,7 +127,7 @@ fn telegrams_have_the_length_that_they_have() {
     assert!(followed.try_next().unwrap().is_none());
     bytes.send_bytes(&[1, 2, 3]).unwrap();
     assert_eq!(*followed.next().unwrap().unwrap(), [1, 2, 3]);
-    assert_eq!(bytes.send_bytes(&[0; 815]).unwrap_err().kind, Kind::Short);
+    assert_eq!(bytes.send_bytes(&[0; 815]).unwrap_err().kind(), ErrorKind::ResourceExhausted);
     assert_eq!((bytes.failed(), bytes.next_number()), (1, 2));
 }
 
@@ -140,13 +140,13 @@ fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
         PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default())
             .map(drop)
             .unwrap_err()
-            .kind,
-        Kind::DomainHeld
+            .kind(),
+        ErrorKind::DomainHeld
     );
     let topic = |name: &str| session.sensor(name).and_then(|sensor| sensor.topic::<Scan>()).map(drop);
     // A hub may have a sensor without a dot, now or later.
     for impossible in ["front", "near", "", "robot", "tracker.Near", "a.b.c"] {
-        assert_eq!(topic(impossible).unwrap_err().kind, Kind::Configuration, "{impossible}");
+        assert_eq!(topic(impossible).unwrap_err().kind(), ErrorKind::InvalidInput, "{impossible}");
     }
     assert!(topic("tracker.near").is_ok() && session.check_room(&Topic::ALL).is_ok());
     // The hub goes on.
@@ -168,18 +168,18 @@ fn programs_with_names_of_their_own_publish_at_once_with_a_hub_and_without() {
     let mut yard = beside("yard").unwrap().topic::<Event>().unwrap();
     assert_eq!(publisher(place.domain.root()), Ok(None), "nobody holds the domain");
     let again = beside("house").map(drop).unwrap_err();
-    assert_eq!(again.kind, Kind::NameHeld);
+    assert_eq!(again.kind(), ErrorKind::NameHeld);
     let held = |name: &str| format!("the name {name} is published by process {} (", std::process::id());
-    assert!(again.message.starts_with(&held("house")), "{again}");
+    assert!(again.message().starts_with(&held("house")), "{again}");
     let _listener = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let of_hub = beside("front").map(drop).unwrap_err();
-    assert_eq!(of_hub.kind, Kind::NameHeld);
-    assert!(of_hub.message.starts_with(&held("front")), "{of_hub}");
+    assert_eq!(of_hub.kind(), ErrorKind::NameHeld);
+    assert!(of_hub.message().starts_with(&held("front")), "{of_hub}");
     let scans = house.topic::<Scan>().map(drop).unwrap_err();
-    assert_eq!(scans.kind, Kind::Configuration, "only sensors have scans: {scans}");
+    assert_eq!(scans.kind(), ErrorKind::InvalidInput, "only sensors have scans: {scans}");
     for impossible in ["", "robot", "tracker.near"] {
-        assert_eq!(beside(impossible).map(drop).unwrap_err().kind, Kind::Configuration, "{impossible}");
+        assert_eq!(beside(impossible).map(drop).unwrap_err().kind(), ErrorKind::InvalidInput, "{impossible}");
     }
     let mut seen = Subscription::<Tracks>::in_domain(place.places(), "house").unwrap();
     let mut happened = Subscription::<Event>::in_domain(place.places(), "yard").unwrap();
@@ -223,5 +223,5 @@ fn samples_of_any_length_ring_the_bell_of_those_who_sleep_at_it() {
     }
     let longer = Scan::of(ScanHead::default(), &[7; 4_000]);
     let refused = scans.send_len(longer.bytes().len(), |_| unreachable!("there is no memory for it"));
-    assert_eq!(refused.unwrap_err().kind, Kind::Short);
+    assert_eq!(refused.unwrap_err().kind(), ErrorKind::ResourceExhausted);
 }

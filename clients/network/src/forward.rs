@@ -115,7 +115,7 @@ impl Forwarder {
         }
         if !self.discovery.has_begun() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
-            tell(Notice::NoHub(self.session.no_hub()))?;
+            tell(Notice::NoHub(self.session.no_hub().into()))?;
         }
         Ok(self.discover(now, carrier)?)
     }

@@ -130,7 +130,7 @@ impl<'a> Reception<'a> {
         let hubs = names.hubs(wanted.hubs)?;
         let open = |domain| {
             let publication = publish::open(domain, wanted.limits, wanted.memory)?;
-            Ok(if wanted.only_proven { publication.only_proven() } else { publication })
+            Ok::<_, Failure>(if wanted.only_proven { publication.only_proven() } else { publication })
         };
         let publication = wanted.publish.map(open).transpose()?;
         let key_name = wanted.key.as_ref().map(Key::name);

@@ -417,7 +417,7 @@ impl<'a> Following<'a> {
             round.next_topic();
             return Ok(());
         }
-        let received = match topic.source.receive(&mut self.session) {
+        let received = match topic.source.receive(&mut self.session).map_err(Failure::from) {
             Err(failure) if failure.kind == Kind::Short && self.despite_shortage => {
                 self.short_until = Some(Instant::now() + SHORTAGE_PAUSE);
                 self.events.push_back(Event::Short(topic.name.clone(), failure));
@@ -512,7 +512,7 @@ impl<'a> Following<'a> {
                 }
                 if !self.waiting_said {
                     self.waiting_said = true;
-                    self.notice(Notice::NoHub(self.session.no_hub()), |_| true);
+                    self.notice(Notice::NoHub(self.session.no_hub().into()), |_| true);
                 }
             }
             Some(seen) if now - seen >= GRACE => self.check_sensors()?,

@@ -25,6 +25,12 @@ impl From<Failure> for End {
     }
 }
 
+impl From<scanhub_client::Error> for End {
+    fn from(error: scanhub_client::Error) -> End {
+        End::Failure(error.into())
+    }
+}
+
 impl From<io::Error> for End {
     fn from(error: io::Error) -> End {
         if error.kind() == ErrorKind::BrokenPipe {

@@ -37,8 +37,8 @@ pub type Sample<P, S = LocalService> = iceoryx2::sample::Sample<S, <P as Payload
 /// A loaned sample that is not sent yet.
 pub type SampleMut<P, S = LocalService> = iceoryx2::sample_mut::SampleMut<S, <P as Payload>::Memory, Header>;
 
-/// Payload of a topic: `[u8]` (telegram), or a type of this crate.
-pub trait Payload: Debug + 'static {
+/// Payload of a topic: `[u8]` (telegram), or a type of `scanhub-schema`. Other crates cannot implement it.
+pub trait Payload: sealed::Sealed + Debug + 'static {
     /// Topic of this payload.
     const TOPIC: Topic;
 
@@ -118,10 +118,16 @@ pub trait Payload: Debug + 'static {
     fn bytes(&self) -> &[u8];
 }
 
+mod sealed {
+    pub trait Sealed {}
+}
+
 /// In iceoryx2, slices and values have two impl blocks with the same code. This macro generates both.
 macro_rules! payload {
     ($payload:ty, $topic:expr, $memory:ty, $len:ident, $owned:ty, $make:expr,
         |$builder:ident, $limits:ident| $sized:expr, |$publisher:ident| $loan:expr, $read:path, $write:path, $bytes:path) => {
+        impl sealed::Sealed for $payload {}
+
         impl Payload for $payload {
             const TOPIC: Topic = $topic;
 

@@ -58,7 +58,7 @@ fn whole(block: &Block) -> String {
     let Block { language, text, .. } = block;
     match language.as_str() {
         "rust" if !text.contains("fn main") => {
-            format!("fn main() -> Result<(), scanhub_client::Failure> {{\n{text}}}\n")
+            format!("fn main() -> Result<(), scanhub_client::Error> {{\n{text}}}\n")
         }
         "c" if !text.contains("int main") => format!("{C}int main(void)\n{{\n{LINES}{text}return 0;\n}}\n"),
         "cpp" if !text.contains("int main") => format!("{CPP}int main()\n{{\n{LINES}{text}}}\n"),

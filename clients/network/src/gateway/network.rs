@@ -64,7 +64,7 @@ impl Network {
         };
         let groups = interface.map(|interface| {
             let destination = UdpDestination::groups(interface.name(), port, ttl)?;
-            Ok(Groups { interface, destination })
+            Ok::<_, Failure>(Groups { interface, destination })
         });
         let mut groups = groups.transpose()?;
         let mut copies: Vec<UdpDestination> = Vec::new();

@@ -81,7 +81,7 @@ impl TopicStore for SharedMemory {
     type Sensor = SharedTopics;
 
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure> {
-        self.session.check_room(topics)
+        Ok(self.session.check_room(topics)?)
     }
 
     fn fits(&self, topics: &[Topic]) -> bool {

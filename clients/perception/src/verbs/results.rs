@@ -5,10 +5,10 @@ use std::io::{self, Write};
 use std::rc::Rc;
 
 use scanhub_client::streams::find;
-use scanhub_client::{Payload, Publication, PublishSession, SensorPublisher};
+use scanhub_client::{Publication, PublishSession, SensorPublisher};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Flags, Header};
-use scanhub_shm::Domain;
+use scanhub_shm::{Domain, Payload};
 use scanhub_verbs::follow::Notice;
 use scanhub_verbs::names::{TopicName, position};
 use scanhub_verbs::output::{End, Output};

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use crate::echo::{Format, start};
 use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
 use crate::{context, named};
-use scanhub_client::{RobotFollower, ZonesFollower};
-use scanhub_schema::{Kind, Verdict};
+use scanhub_client::{ErrorKind, RobotFollower, ZonesFollower};
+use scanhub_schema::Verdict;
 use scanhub_verbs::Bounds;
 use scanhub_verbs::hz::HzArgs;
 
@@ -162,7 +162,7 @@ fn the_robot_is_the_worst_of_its_sensors() {
     let verdicts: Vec<_> = named.now().unwrap().sensors().map(|(_, verdict)| verdict).collect();
     assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never heard");
     let refused = RobotFollower::in_domain(place.places(), &["robot"]).err();
-    assert_eq!(refused.map(|failure| failure.kind), Some(Kind::Configuration));
+    assert_eq!(refused.map(|error| error.kind()), Some(ErrorKind::InvalidInput));
 }
 
 #[test]

@@ -212,9 +212,9 @@ fn problem(scene: &Scene, places: &[Domain]) -> Option<Problem> {
         return scene.sensors.is_empty().then(|| Problem { what: what(), remedy: remedy() });
     }
     let mut session = Session::new(places.to_vec());
-    let failure = session.look().err();
+    let failure = session.look().err().map(Failure::from);
     let Failure { message, hint, .. } = match session.publishes() {
-        None => failure.unwrap_or_else(|| session.no_hub_here()),
+        None => failure.unwrap_or_else(|| session.no_hub_here().into()),
         Some(Who::Hub) => return None,
         Some(Who::Listener) => Failure::new(
             Kind::NoTopic,
