@@ -166,8 +166,9 @@ impl Scanner {
     fn run(&self, stage: &Stage, flags: &[&str], span: Duration) -> Outcome<Run> {
         let _simulator = stage.simulate_as(&[SENSOR], flags)?;
         let hub = self.hub(stage)?;
-        let beams = consumer::subscribe::<Scan>(stage.domain.name(), SENSOR)?
+        let beams = consumer::builder::<Scan>(stage.domain.name(), SENSOR)
             .timeout(Duration::from_secs(8))
+            .open()?
             .next()?
             .map_or(0, |scan| scan.beams());
         let (early, zones) = thread::scope(|scope| {
@@ -258,7 +259,8 @@ impl Run {
 
 /// Headers of a topic for `span` from its first sample on, and what `take` takes of each.
 fn heard<P: Payload, T>(stage: &Stage, span: Duration, take: impl Fn(&P) -> T) -> Outcome<Vec<(Header, T)>> {
-    let mut topic = consumer::subscribe::<P>(stage.domain.name(), SENSOR)?.timeout(Duration::from_secs(8));
+    let mut topic =
+        consumer::builder::<P>(stage.domain.name(), SENSOR).timeout(Duration::from_secs(8)).open()?;
     let mut heard = Vec::new();
     let mut end = None;
     while let Some(sample) = topic.next()? {

@@ -158,7 +158,8 @@ impl Look {
 fn counters(stage: &Stage, sensors: &[&str]) -> Outcome<(f64, f64)> {
     let mut sum = (0, 0);
     for sensor in sensors {
-        let mut statuses = consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(PATIENCE);
+        let mut statuses =
+            consumer::builder::<Status>(stage.domain.name(), sensor).timeout(PATIENCE).open()?;
         let status = statuses.next()?.ok_or("no status")?;
         sum.0 += status.counters[Counter::Wakeups];
         sum.1 += status.counters[Counter::Telegrams];

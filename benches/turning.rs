@@ -243,8 +243,9 @@ fn share(pid: u32, span: Duration) -> Outcome<f64> {
 fn lost(stage: &Stage) -> Outcome<u64> {
     let mut sum = 0;
     for sensor in SENSORS {
-        let mut statuses =
-            consumer::subscribe::<Status>(stage.domain.name(), sensor)?.timeout(Duration::from_secs(3));
+        let mut statuses = consumer::builder::<Status>(stage.domain.name(), sensor)
+            .timeout(Duration::from_secs(3))
+            .open()?;
         sum += statuses.next()?.ok_or("no status")?.counters[Counter::LostOnLine];
     }
     Ok(sum)

@@ -228,7 +228,7 @@ type Received = HashMap<i64, f64>;
 fn receive(stage: &Stage, sensor: &str, over: &AtomicBool) -> Result<Received, String> {
     let follow = || -> Outcome<Received> {
         let mut received = Received::new();
-        let mut scans = consumer::subscribe::<Scan>(stage.domain.name(), sensor)?.timeout(PATIENCE);
+        let mut scans = consumer::builder::<Scan>(stage.domain.name(), sensor).timeout(PATIENCE).open()?;
         while !over.load(Ordering::Relaxed) {
             let scan = scans.next()?.ok_or("no scan")?;
             let now_ms = SystemTime::now().duration_since(UNIX_EPOCH)?.as_secs_f64() * 1e3;
@@ -246,7 +246,7 @@ fn key(stamp_ms: f64) -> i64 {
 
 /// Returns the ages of scans at a subscriber, in us, sorted.
 fn ages(stage: &Stage, span: Duration) -> Outcome<Vec<f64>> {
-    let mut scans = consumer::subscribe::<Scan>(stage.domain.name(), SENSORS[0])?.timeout(PATIENCE);
+    let mut scans = consumer::builder::<Scan>(stage.domain.name(), SENSORS[0]).timeout(PATIENCE).open()?;
     let (mut ages, until) = (Vec::new(), clock::now() + span.as_nanos() as u64);
     while clock::now() < until {
         let stamp = scans.next()?.ok_or("no scan")?.header().stamp_last_ns;

@@ -59,7 +59,7 @@ impl Way {
             Way::Doorbell => "topic, doorbell",
             Way::Event => "topic, event",
             Way::Spin => "topic, spinning",
-            Way::Subscription => "topic, Subscription::next",
+            Way::Subscription => "topic, Subscriber::next",
             Way::Multicast => "UDP multicast",
             Way::UnixDatagram => "Unix datagrams",
             Way::UnixStream => "Unix streams",

@@ -3,7 +3,6 @@
 //! woken once.
 
 use iceoryx2::prelude::ServiceName;
-use scanhub_client::Subscription;
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Header, Ring, Scan, ScanHead, Topic, Wake, limits};
 use scanhub_shm::{Bell, Listener, Node, Payload, Publisher, SampleMut, Subscriber, TopicService, Waker};
@@ -215,7 +214,7 @@ impl Outlet for Scans {
 }
 
 /// A subscriber to scans that uses the client library.
-pub(crate) struct ScansInlet(Subscription<Scan>);
+pub(crate) struct ScansInlet(scanhub_client::Subscriber<Scan>);
 
 impl ScansInlet {
     pub(crate) fn new(task: &Task) -> Outcome<ScansInlet> {

@@ -11,7 +11,7 @@ use scanhub_client::Wait;
 use scanhub_schema::Scan;
 
 use crate::growth::{Quantity, Sweep};
-use crate::support::consumer::subscribe;
+use crate::support::consumer::builder;
 use crate::support::figures::{self, Cell, Figure, Target, percentile};
 use crate::support::stage::{Child, PATIENCE, SENSORS, Stage};
 use crate::support::truth::Truth;
@@ -65,8 +65,8 @@ pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wai
     let wait = if wait == "event" { Wait::Event } else { Wait::Doorbell };
     let all = Barrier::new(count + 1);
     let follow = || -> Result<(Vec<(u64, u64)>, u64), String> {
-        let attached = subscribe::<Scan>(domain, sensor).map(|scans| scans.wait_by(wait).timeout(PATIENCE));
-        let attached = attached.and_then(|mut scans| {
+        let attached = builder::<Scan>(domain, sensor).wait(wait).timeout(PATIENCE).open();
+        let attached = attached.map_err(Into::into).and_then(|mut scans| -> Outcome<_> {
             scans.next()?.map(drop).map_or(Err("no scan arrived".into()), |()| Ok(scans))
         });
         // The others do not wait for a subscriber that fails.

@@ -186,7 +186,7 @@ fn sum_of_missed(lines: &[Line]) -> Outcome<f64> {
 }
 
 fn counter(stage: &Stage, counter: Counter) -> Outcome<f64> {
-    let mut status = consumer::subscribe::<Status>(stage.domain.name(), SENSOR)?.timeout(PATIENCE);
+    let mut status = consumer::builder::<Status>(stage.domain.name(), SENSOR).timeout(PATIENCE).open()?;
     Ok(status.next()?.ok_or("no status")?.counters[counter] as f64)
 }
 

@@ -8,10 +8,9 @@ use std::sync::{Arc, Barrier};
 use std::thread;
 use std::time::Duration;
 
-use scanhub_client::Subscription;
+use scanhub_client::{Subscriber, SubscriberBuilder};
 use scanhub_schema::{Header, Scan, Status, limits};
 use scanhub_shm::Payload;
-use scanhub_shm::{Domain, Environment};
 
 use super::stage::PATIENCE;
 use super::{Outcome, clock, truth};
@@ -96,9 +95,13 @@ pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
 }
 
 /// Subscribes to a topic of the hub of this domain.
-pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Subscription<P>> {
-    let places = Domain::candidates(domain, None, &Environment::of_process())?;
-    Ok(Subscription::in_domain(places, sensor)?)
+pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Subscriber<P>> {
+    Ok(builder(domain, sensor).open()?)
+}
+
+/// Returns the options of a subscriber of a topic of the hub of this domain.
+pub(crate) fn builder<P: Payload + ?Sized>(domain: &str, sensor: &str) -> SubscriberBuilder<Subscriber<P>> {
+    Subscriber::builder(sensor).domain(domain)
 }
 
 struct Found {
@@ -158,7 +161,7 @@ pub(crate) fn hold(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
 pub(crate) fn stay(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut consumers = Vec::new();
     for _ in 0..count {
-        let mut consumer = subscribe::<Scan>(domain, sensor)?.timeout(PATIENCE);
+        let mut consumer = builder::<Scan>(domain, sensor).timeout(PATIENCE).open()?;
         if let Err(failure) = consumer.next() {
             println!("refused {} {}", consumers.len(), failure.message());
             break;
@@ -185,7 +188,7 @@ fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outco
         Ok::<_, &str>(scan.ok_or("no scan arrived")?.header().topic_seq)
     };
     let attached = || -> Outcome<_> {
-        let mut scans = subscribe::<Scan>(domain, sensor)?.timeout(PATIENCE);
+        let mut scans = builder::<Scan>(domain, sensor).timeout(PATIENCE).open()?;
         last(scans.next()?)?;
         Ok(scans)
     };

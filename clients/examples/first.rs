@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use scanhub_client::{Error, Scan, subscribe};
+use scanhub_client::{Error, Scan, Subscriber};
 
 fn main() -> Result<(), Error> {
-    let mut scans = subscribe::<Scan>("front")?.timeout(Duration::from_millis(500));
+    let mut scans = Subscriber::<Scan>::builder("front").timeout(Duration::from_millis(500)).open()?;
     loop {
         let Some(scan) = scans.next()? else {
-            println!("no scan for half a second; there is a hub: {}", scans.hub_lives());
+            println!("no scan for half a second; there is a hub: {}", scans.hub_is_running());
             continue;
         };
         if scan.missed > 0 || scan.restarted {

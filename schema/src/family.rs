@@ -5,6 +5,10 @@
 //! or whole packets of another family that arrived together. The hub has checked it before it publishes it.
 
 use std::f64::consts::TAU;
+use std::ops::{Deref, DerefMut};
+
+use bytemuck::TransparentWrapper;
+use bytemuck::allocation::TransparentWrapperAlloc;
 
 use crate::text::named;
 use crate::{Code, Contents, ScanHead};
@@ -267,6 +271,47 @@ impl<'a> Telegram<'a> {
     /// Returns what lies between command and CRC: the data and, last, the status byte.
     pub fn data(self) -> &'a [u8] {
         self.bytes.get(5..self.bytes.len().saturating_sub(2)).unwrap_or_default()
+    }
+}
+
+/// Payload of the topic `telegram`: the bytes of one telegram, as the scanner sent them.
+#[derive(Debug, PartialEq, Eq, TransparentWrapper)]
+#[repr(transparent)]
+pub struct TelegramBytes([u8]);
+
+impl TelegramBytes {
+    /// Returns the bytes.
+    pub fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+
+    /// Returns the payload of these bytes.
+    pub fn of_bytes(bytes: &[u8]) -> &TelegramBytes {
+        TransparentWrapper::wrap_ref(bytes)
+    }
+
+    /// Returns the payload of these bytes, for writing.
+    pub fn of_bytes_mut(bytes: &mut [u8]) -> &mut TelegramBytes {
+        TransparentWrapper::wrap_mut(bytes)
+    }
+
+    /// Returns a payload of `len` zeros.
+    pub fn zeroed(len: usize) -> Box<TelegramBytes> {
+        TransparentWrapperAlloc::wrap_box(vec![0; len].into_boxed_slice())
+    }
+}
+
+impl Deref for TelegramBytes {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+impl DerefMut for TelegramBytes {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.0
     }
 }
 

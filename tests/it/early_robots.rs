@@ -7,7 +7,7 @@ use crate::client_c::installed::{Installed, source};
 use crate::early::POST;
 use crate::python::check_on;
 use crate::testkit::{INT, Program, TERM, TestEnv, until};
-use scanhub_client::{Publication, PublishSession, RobotFollower, SensorPublisher};
+use scanhub_client::{Publication, PublishSession, RobotSubscriber, SensorPublisher};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Early, Header, Topic, Verdict, Wake, Zones};
 use serde_json::Value;
@@ -97,8 +97,9 @@ fn robots_in_all_languages_take_warnings_if_they_are_wanted() {
     let env = TestEnv::new();
     let mut sensor = Warning::new(&env);
     let mut robots = robots(&env);
-    let in_domain = || RobotFollower::in_domain(vec![env.place()], &["robot1.front"]).expect("a name");
-    let mut in_rust = [(false, in_domain()), (true, in_domain().with_early())];
+    let builder = || RobotSubscriber::builder(&["robot1.front"]).in_domain(&env.place());
+    let mut in_rust = [(false, builder()), (true, builder().early())]
+        .map(|(is_early, builder)| (is_early, builder.open().expect("a name")));
     let all = robots.len() as u64 + 2;
     until("zones are followed by all, and warnings by those who want them", || {
         for (_, robot) in &mut in_rust {

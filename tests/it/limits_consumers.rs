@@ -11,7 +11,7 @@ use crate::testkit::{
     until,
 };
 use rustix::process::Signal;
-use scanhub_client::Subscription;
+use scanhub_client::Subscriber;
 use scanhub_schema::{Scan, Topic, Zones, limits};
 use scanhub_shm::Domain;
 use scanhub_shm::Payload;
@@ -31,8 +31,8 @@ fn streaming(env: &TestEnv, period_ms: u32, flags: &[&str]) -> Program {
     env.hub(&[&["--link", &format!("front=file:{file}")], flags].concat())
 }
 
-fn subscribe(place: &Domain) -> Subscription<Scan> {
-    Subscription::in_domain(vec![place.clone()], "front").expect("a name").timeout(Duration::from_secs(20))
+fn subscribe(place: &Domain) -> Subscriber<Scan> {
+    Subscriber::builder("front").in_domain(place).timeout(Duration::from_secs(20)).open().expect("a name")
 }
 
 /// Subscribes `count` consumers and receives until each has `wanted` scans: what they missed between them, in all.

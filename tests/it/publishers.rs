@@ -4,7 +4,7 @@
 use std::io::{PipeWriter, Write};
 use std::process::Command;
 
-use scanhub_client::{ErrorKind, PublishSession, Subscription, clock};
+use scanhub_client::{ErrorKind, PublishSession, Subscriber, clock};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Maker, Quality, Tilt, Topic};
 use scanhub_shm::Bell;
@@ -69,8 +69,8 @@ fn listener(env: &TestEnv) -> PublishSession {
     PublishSession::open(&env.place(), &[Topic::Marks], TopicLimits::default()).expect("nobody else")
 }
 
-fn follow(env: &TestEnv) -> Subscription<Tilt> {
-    Subscription::in_domain(vec![env.place()], "mount").expect("a name")
+fn follow(env: &TestEnv) -> Subscriber<Tilt> {
+    Subscriber::builder("mount").in_domain(&env.place()).open().expect("a name")
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! too, and whoever comes back is heard again.
 
 use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, until};
-use scanhub_client::{Robot, RobotFollower};
+use scanhub_client::{Robot, RobotSubscriber};
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
@@ -63,7 +63,8 @@ fn a_sensor_that_dies_makes_the_robot_unknown_and_so_does_the_hub() {
 #[test]
 fn a_program_that_follows_the_robot() {
     let env = TestEnv::new();
-    let mut robot = RobotFollower::in_domain(vec![env.place()], &["front", "rear"]).expect("possible names");
+    let mut robot =
+        RobotSubscriber::builder(&["front", "rear"]).in_domain(&env.place()).open().expect("possible names");
     let first = robot.next().expect("no hub is no failure");
     assert_eq!((first.verdict(), first.worst()), (Verdict::Unknown, Some("front")));
     let _front = sensor(&env, "front");
@@ -114,9 +115,9 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         // A hub has sensors of its own, and when it goes nobody stands in for them.
         let _sensor = sensor(&env, "front");
         // One who always finds something that is sent from elsewhere, too.
-        let mut busy = RobotFollower::in_domain(vec![env.place()], &[]).expect("no names");
+        let mut busy = RobotSubscriber::builder(&[]).in_domain(&env.place()).open().expect("no names");
         let names = |robot: &Robot| robot.sensors().map(|(name, _)| name.to_owned()).collect::<Vec<_>>();
-        let mut hear = |busy: &mut RobotFollower| {
+        let mut hear = |busy: &mut RobotSubscriber| {
             front.send(Topic::Zones, &Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() });
             until("it is heard", || busy.try_next().expect("a domain").is_some());
             names(busy.now().expect("a domain"))

@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 
-use scanhub_client::Subscription;
+use scanhub_client::Subscriber;
 use scanhub_schema::Tilt;
 use scanhub_sim::world::World;
 use serde_json::Value;
@@ -173,7 +173,8 @@ fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacl
     for start in languages(&hall.env) {
         let mut mount = Mount::publishing(start("mount"));
         let mut tilt = hall.tilt(&[NEAR]);
-        let mut encoder = Subscription::<Tilt>::in_domain(vec![hall.env.place()], "encoder").expect("a name");
+        let mut encoder =
+            Subscriber::<Tilt>::builder("encoder").in_domain(&hall.env.place()).open().expect("a name");
         let mut said = 0;
         let found = loop {
             assert!(said < 10_000, "no obstacle in so many angles");

@@ -6,7 +6,7 @@ use std::ffi::{CStr, c_char, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
-use scanhub_client::{Wait, places};
+use scanhub_client::Wait;
 use scanhub_schema::{Tilt, Topic};
 
 use crate::boundary::{CallError, Lent, last_message, place, sample, text};
@@ -28,7 +28,7 @@ pub extern "C" fn scanhub_open(
             text(sensor)?.ok_or(CallError::Argument("no sensor is named", "for example \"front\""))?;
         let topic = u8::try_from(topic).ok().and_then(Topic::of_number);
         let topic = topic.ok_or(CallError::Argument("there is no such topic", "one of SCANHUB_TOPIC_.."))?;
-        let opened = Handle::open(places(text(domain)?)?, sensor, topic, wait_by(wait)?)?;
+        let opened = Handle::open(text(domain)?, sensor, topic, wait_by(wait)?)?;
         handle.write(insert(opened)?);
         Ok(0)
     })
@@ -66,7 +66,7 @@ fn open_robot(
     let handle = place(handle)?;
     handle.write(std::ptr::null_mut());
     let sensors: Vec<&str> = text(sensors)?.unwrap_or_default().split_ascii_whitespace().collect();
-    let opened = Handle::open_robot(places(text(domain)?)?, &sensors, wait_by(wait)?, early)?;
+    let opened = Handle::open_robot(text(domain)?, &sensors, wait_by(wait)?, early)?;
     handle.write(insert(opened)?);
     Ok(0)
 }

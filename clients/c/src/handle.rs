@@ -16,8 +16,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Domain, Error, Heard, Payload, Publication, Received, Robot, RobotFollower, Subscription, Wait,
-    ZonesFollower, home,
+    Error, Heard, Payload, Publication, Received, Robot, RobotSubscriber, Subscriber, SubscriberBuilder,
+    Wait, ZonesSubscriber, publish_domain,
 };
 use scanhub_schema::{Header, Tilt, Topic, limits};
 
@@ -38,10 +38,10 @@ const LENT: usize = limits::BORROWED;
 /// Type that follows a topic: zones expire, other samples do not.
 macro_rules! follower {
     (Zones $payload:tt) => {
-        ZonesFollower
+        ZonesSubscriber
     };
     ($topic:ident $payload:tt) => {
-        Subscription<scanhub_schema::payload_type!($payload)>
+        Subscriber<scanhub_schema::payload_type!($payload)>
     };
 }
 
@@ -58,15 +58,16 @@ macro_rules! sample {
 /// Declares the sources and samples from the table of topics. A robot combines the zones of its sensors.
 macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        enum Source { Robot(RobotFollower), $($topic(follower!($topic $payload)),)* }
+        enum Source { Robot(RobotSubscriber), $($topic(follower!($topic $payload)),)* }
 
         enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }
 
         impl Source {
-            fn open(places: Vec<Domain>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Error> {
+            fn open(domain: Option<&str>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Error> {
                 Ok(match topic {
                     $(Topic::$topic => {
-                        Source::$topic(<follower!($topic $payload)>::in_domain(places, sensor)?.wait_by(wait))
+                        let builder = <follower!($topic $payload)>::builder(sensor).wait(wait);
+                        Source::$topic(in_domain(builder, domain).open()?)
                     })*
                 })
             }
@@ -94,8 +95,8 @@ macro_rules! topics {
 
             fn hub_lives(&self) -> bool {
                 match self {
-                    Source::Robot(robot) => robot.hub_lives(),
-                    $(Source::$topic(topic) => topic.hub_lives(),)*
+                    Source::Robot(robot) => robot.hub_is_running(),
+                    $(Source::$topic(topic) => topic.hub_is_running(),)*
                 }
             }
         }
@@ -138,26 +139,26 @@ impl<P: Payload + ?Sized> Lend for Received<P> {
 }
 
 impl Handle {
-    /// Follows `topic` of `sensor` in the first live one of `places`.
+    /// Follows `topic` of `sensor` in `domain`, or in the domain that the environment names.
     pub(crate) fn open(
-        places: Vec<Domain>,
+        domain: Option<&str>,
         sensor: &str,
         topic: Topic,
         wait: Wait,
     ) -> Result<Handle, CallError> {
-        Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
+        Ok(Handle::of(Source::open(domain, sensor, topic, wait)?))
     }
 
-    /// Follows the robot of `sensors` (if empty: all) in the first live one of `places`, with or without `early`
+    /// Follows the robot of `sensors` (if empty: all) in `domain`, as [`open`](Self::open) does, with or without `early`
     /// warnings.
     pub(crate) fn open_robot(
-        places: Vec<Domain>,
+        domain: Option<&str>,
         sensors: &[&str],
         wait: Wait,
         early: bool,
     ) -> Result<Handle, CallError> {
-        let robot = RobotFollower::in_domain(places, sensors)?.wait_by(wait);
-        Ok(Handle::of(Source::Robot(if early { robot.with_early() } else { robot })))
+        let robot = in_domain(RobotSubscriber::builder(sensors).wait(wait), domain);
+        Ok(Handle::of(Source::Robot(if early { robot.early() } else { robot }.open()?)))
     }
 
     fn of(source: Source) -> Handle {
@@ -215,14 +216,22 @@ impl Handle {
         Ok(())
     }
 
-    /// As [`Subscription::descriptor`].
+    /// As [`Subscriber::descriptor`].
     pub(crate) fn descriptor(&mut self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
 
-    /// As [`Subscription::hub_lives`].
+    /// As [`Subscriber::hub_is_running`].
     pub(crate) fn hub_lives(&self) -> bool {
         self.source.hub_lives()
+    }
+}
+
+/// Sets the domain, if the program names one.
+fn in_domain<T>(builder: SubscriberBuilder<T>, domain: Option<&str>) -> SubscriberBuilder<T> {
+    match domain {
+        Some(domain) => builder.domain(domain),
+        None => builder,
     }
 }
 
@@ -305,7 +314,7 @@ pub(crate) struct Mount(Publication<Tilt>);
 impl Mount {
     /// Publishes as `name` in `domain`, or in the domain that the environment names.
     pub(crate) fn publish(domain: Option<&str>, name: &str) -> Result<Mount, CallError> {
-        Ok(Mount(Publication::in_domain(&home(domain)?, name)?))
+        Ok(Mount(Publication::in_domain(&publish_domain(domain)?, name)?))
     }
 
     /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC; 0 means now.

@@ -18,12 +18,13 @@ use crate::presence::{GRACE, find};
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
 ///
-/// use scanhub_client::{Error, Request, Verb, places, request};
+/// use scanhub_client::{DEFAULT_DOMAIN, Domain, Environment, Error, Request, Verb, request};
 ///
 /// fn main() -> Result<(), Error> {
 ///     // Set by a signal, for example.
 ///     let stop = AtomicBool::new(false);
-///     request(&places(None)?, &Request::new("front", Verb::Reset), &stop)?;
+///     let places = Domain::candidates(DEFAULT_DOMAIN, None, &Environment::of_process())?;
+///     request(&places, &Request::new("front", Verb::Reset), &stop)?;
 ///     Ok(())
 /// }
 /// ```

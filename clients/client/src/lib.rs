@@ -28,6 +28,7 @@
 //! }
 //! ```
 
+mod builder;
 pub mod clock;
 mod control;
 mod error;
@@ -42,23 +43,26 @@ mod subscribe;
 mod wait;
 mod zones;
 
+pub use builder::SubscriberBuilder;
 pub use control::request;
 pub use error::{Cause, Error, ErrorKind};
 pub use follower::Received;
 pub use presence::{live_sensors, live_topics};
-pub use publish::{Publication, PublishSession, SensorPublisher, home, publish};
-pub use robot::{Robot, RobotFollower, robot};
-pub use subscribe::{Subscription, places, subscribe};
+pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};
+pub use robot::{Robot, RobotSubscriber, robot};
+pub use subscribe::{Subscriber, subscribe};
 pub use wait::Wait;
-pub use zones::{Heard, ZonesFollower, zones};
+pub use zones::{Heard, ZonesSubscriber, zones};
 
+/// Payload of the topic `telegram`: the bytes of a telegram.
+pub use scanhub_schema::TelegramBytes as Telegram;
 /// Types of topics and payloads, so that a program needs no other dependency.
 pub use scanhub_schema::{
     Age, Flags, Header, Pose, Quality, ROBOT, Reasons, Request, Shown, Topic, Verb, Wake, payloads::*,
 };
 pub use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
-/// Payload of a topic: `[u8]` (telegrams), or a type of this crate such as [`Scan`]. Other crates cannot implement it.
+/// Payload of a topic: a type of this crate such as [`Scan`]. Other crates cannot implement it.
 ///
 /// ```compile_fail,E0277
 /// #[derive(Debug)]
@@ -83,16 +87,17 @@ impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
 }
 
 /// Many topics in one thread: a session in a domain, sources of topics in it, and the state of the hub. It is for
-/// programs that need more than a [`Subscription`].
+/// programs that need more than a [`Subscriber`].
 ///
 /// # Examples
 ///
 /// ```no_run
 /// use scanhub_client::streams::{Session, Source};
-/// use scanhub_client::{Error, Topic, places};
+/// use scanhub_client::{DEFAULT_DOMAIN, Domain, Environment, Error, Topic};
 ///
 /// fn main() -> Result<(), Error> {
-///     let mut session = Session::new(places(None)?);
+///     let places = Domain::candidates(DEFAULT_DOMAIN, None, &Environment::of_process())?;
+///     let mut session = Session::new(places);
 ///     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
 ///     loop {
 ///         session.look()?;

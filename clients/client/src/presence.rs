@@ -225,9 +225,9 @@ pub const GRACE: Duration = Duration::from_millis(500);
 /// # Examples
 ///
 /// ```
-/// use scanhub_client::{live_sensors, places};
+/// use scanhub_client::{Domain, Environment, live_sensors};
 ///
-/// let places = places(Some("no-hub-is-here"))?;
+/// let places = Domain::candidates("no-hub-is-here", None, &Environment::of_process())?;
 /// assert!(live_sensors(&places).is_empty());
 /// # Ok::<(), scanhub_client::Error>(())
 /// ```

@@ -9,10 +9,11 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Header, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
 use scanhub_shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use scanhub_shm::{
-    DEFAULT_DOMAIN, Domain, DueRings, Environment, ListenLock, NameLock, Payload, Role, SharedMemory,
-    ThreadSafeService, TopicPublisher, holder, name_held, publisher_domain,
+    Domain, DueRings, Environment, ListenLock, NameLock, Payload, Role, SharedMemory, ThreadSafeService,
+    TopicPublisher, holder, name_held, publisher_domain,
 };
 
+use crate::builder::domain_of_process;
 use crate::clock;
 use crate::error::Error;
 
@@ -49,7 +50,7 @@ type Waker = scanhub_shm::Waker<ThreadSafeService>;
 /// }
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Error> {
-    Publication::in_domain(&home(None)?, name)
+    Publication::in_domain(&publish_domain(None)?, name)
 }
 
 /// Returns where a program publishes in `domain`, or if none is named in that which SCANHUB_DOMAIN names: its first
@@ -58,10 +59,9 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Error>
 /// # Errors
 ///
 /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible.
-pub fn home(domain: Option<&str>) -> Result<Domain, Error> {
-    let of_process = std::env::var("SCANHUB_DOMAIN");
-    let name = domain.unwrap_or(of_process.as_deref().unwrap_or(DEFAULT_DOMAIN));
-    Ok(publisher_domain(name, None, &Environment::of_process())?)
+pub fn publish_domain(domain: Option<&str>) -> Result<Domain, Error> {
+    let name = domain.map_or_else(domain_of_process, str::to_owned);
+    Ok(publisher_domain(&name, None, &Environment::of_process())?)
 }
 
 /// Membership of a publishing process in a domain. It ends when the session and every publisher created from it are

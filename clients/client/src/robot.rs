@@ -3,15 +3,13 @@
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-use scanhub_schema::{Verdict, Zones, check_followed, is_remote};
-use scanhub_shm::Domain;
+use scanhub_schema::{Verdict, Zones, is_remote};
 
+use crate::builder::SubscriberBuilder;
 use crate::clock;
 use crate::error::Error;
 use crate::presence::{GRACE, Who};
 use crate::session::Session;
-use crate::subscribe::places;
-use crate::wait::Wait;
 use crate::zones::{Freshness, Heard, ZonesSource};
 
 /// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
@@ -34,8 +32,8 @@ use crate::zones::{Freshness, Heard, ZonesSource};
 /// # Errors
 ///
 /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
-pub fn robot(sensors: &[&str]) -> Result<RobotFollower, Error> {
-    RobotFollower::in_domain(places(None)?, sensors)
+pub fn robot(sensors: &[&str]) -> Result<RobotSubscriber, Error> {
+    RobotSubscriber::builder(sensors).open()
 }
 
 /// What is known of the robot's surroundings: the zones of each sensor.
@@ -91,40 +89,28 @@ impl Robot {
 }
 
 /// The verdict of a robot that is being followed.
-pub struct RobotFollower {
+pub struct RobotSubscriber {
     session: Session,
     source: RobotSource,
 }
 
-impl RobotFollower {
-    /// Follows as [`robot`] does, in the first live one of `places`.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a sensor's name is not possible.
-    pub fn in_domain(places: Vec<Domain>, sensors: &[&str]) -> Result<RobotFollower, Error> {
-        sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
-        Ok(RobotFollower { session: Session::new(places), source: RobotSource::new(sensors) })
+impl RobotSubscriber {
+    /// Returns the options of a subscriber of the zones of `sensors`. If empty: all sensors, as [`robot`] does.
+    pub fn builder(sensors: &[&str]) -> SubscriberBuilder<RobotSubscriber> {
+        SubscriberBuilder::new(sensors)
     }
 
-    /// Waits by `wait`, as [`Subscription::wait_by`](crate::Subscription::wait_by).
-    pub fn wait_by(self, wait: Wait) -> RobotFollower {
-        RobotFollower { session: self.session.by(wait), ..self }
-    }
-
-    /// Takes early warnings too ([`Early`](scanhub_schema::Early)): the verdict becomes worse before a scan is
-    /// complete, and the hub withdraws the warning if the scan does not confirm it. Call it before the first wait.
-    pub fn with_early(self) -> RobotFollower {
-        RobotFollower { source: self.source.with_early(), ..self }
+    pub(crate) fn new(session: Session, source: RobotSource) -> RobotSubscriber {
+        RobotSubscriber { session, source }
     }
 
     /// Waits until zones of any sensor arrive, or become too old, and returns what is known then. The first call waits
     /// until this is so for each sensor. A sensor becomes unknown as with
-    /// [`ZonesFollower::next`](crate::ZonesFollower::next).
+    /// [`ZonesSubscriber::next`](crate::ZonesSubscriber::next).
     ///
     /// # Errors
     ///
-    /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
+    /// As [`Subscriber::next`](crate::Subscriber::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Error> {
         while !self.hear()? {
@@ -159,7 +145,7 @@ impl RobotFollower {
         }
     }
 
-    /// Sleeps as [`Subscription::wait`](crate::Subscription::wait) does, or until a verdict becomes too old.
+    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until a verdict becomes too old.
     ///
     /// # Errors
     ///
@@ -168,18 +154,18 @@ impl RobotFollower {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// Returns a descriptor to poll, as [`ZonesFollower::descriptor`](crate::ZonesFollower::descriptor).
+    /// Returns a descriptor to poll, as [`ZonesSubscriber::descriptor`](crate::ZonesSubscriber::descriptor).
     ///
     /// # Errors
     ///
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
+    /// As [`Subscriber::descriptor`](crate::Subscriber::descriptor).
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         self.session.descriptor()
     }
 
     /// Returns whether a hub or a listener publishes in the domain, as of the last call of
     /// [`next`](Self::next), [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
-    pub fn hub_lives(&self) -> bool {
+    pub fn hub_is_running(&self) -> bool {
         self.session.domain().is_some()
     }
 

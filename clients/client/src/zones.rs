@@ -5,15 +5,13 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use scanhub_schema::{Early, Flags, Header, Verdict, Zones, check_followed};
-use scanhub_shm::Domain;
+use scanhub_schema::{Early, Flags, Header, Verdict, Zones};
 
+use crate::builder::SubscriberBuilder;
 use crate::clock::{self, Moment};
 use crate::error::Error;
 use crate::follower::Follower;
 use crate::session::Session;
-use crate::subscribe::places;
-use crate::wait::Wait;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -36,8 +34,8 @@ use crate::wait::Wait;
 /// # Errors
 ///
 /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
-pub fn zones(sensor: &str) -> Result<ZonesFollower, Error> {
-    ZonesFollower::in_domain(places(None)?, sensor)
+pub fn zones(sensor: &str) -> Result<ZonesSubscriber, Error> {
+    ZonesSubscriber::builder(sensor).open()
 }
 
 /// New data of a sensor's zones, or the news that none arrives.
@@ -63,25 +61,19 @@ impl Heard {
 }
 
 /// The zones of a sensor that is being followed.
-pub struct ZonesFollower {
+pub struct ZonesSubscriber {
     session: Session,
     source: ZonesSource,
 }
 
-impl ZonesFollower {
-    /// Follows as [`zones`] does, in the first live one of `places`.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the sensor's name is not possible.
-    pub fn in_domain(places: Vec<Domain>, sensor: &str) -> Result<ZonesFollower, Error> {
-        check_followed(sensor)?;
-        Ok(ZonesFollower { session: Session::new(places), source: ZonesSource::new(sensor) })
+impl ZonesSubscriber {
+    /// Returns the options of a subscriber of the zones of `sensor`.
+    pub fn builder(sensor: &str) -> SubscriberBuilder<ZonesSubscriber> {
+        SubscriberBuilder::new(&[sensor])
     }
 
-    /// Waits by `wait`, as [`Subscription::wait_by`](crate::Subscription::wait_by).
-    pub fn wait_by(self, wait: Wait) -> ZonesFollower {
-        ZonesFollower { session: self.session.by(wait), ..self }
+    pub(crate) fn new(session: Session, sensor: &str) -> ZonesSubscriber {
+        ZonesSubscriber { session, source: ZonesSource::new(sensor) }
     }
 
     /// Waits for news: the newest sample, or one `unknown` per silence. That is returned two scan periods and 40 ms
@@ -90,7 +82,7 @@ impl ZonesFollower {
     ///
     /// # Errors
     ///
-    /// As [`Subscription::next`](crate::Subscription::next): nothing is known then either.
+    /// As [`Subscriber::next`](crate::Subscriber::next): nothing is known then either.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Error> {
         loop {
@@ -101,7 +93,7 @@ impl ZonesFollower {
         }
     }
 
-    /// Sleeps as [`Subscription::wait`](crate::Subscription::wait) does, or until the verdict becomes too old.
+    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until the verdict becomes too old.
     ///
     /// # Errors
     ///
@@ -110,19 +102,19 @@ impl ZonesFollower {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// Returns a descriptor to poll, as [`Subscription::descriptor`](crate::Subscription::descriptor), with
+    /// Returns a descriptor to poll, as [`Subscriber::descriptor`](crate::Subscriber::descriptor), with
     /// [`try_next`](Self::try_next) of the zones; it gets readable also when the verdict becomes too old.
     ///
     /// # Errors
     ///
-    /// As [`Subscription::descriptor`](crate::Subscription::descriptor).
+    /// As [`Subscriber::descriptor`](crate::Subscriber::descriptor).
     pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
         self.session.descriptor()
     }
 
     /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or
     /// [`try_next`](Self::try_next) that found no news.
-    pub fn hub_lives(&self) -> bool {
+    pub fn hub_is_running(&self) -> bool {
         self.session.domain().is_some()
     }
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use scanhub_client::{ErrorKind, Subscription, Wait, ZonesFollower};
+use scanhub_client::{ErrorKind, Subscriber, Wait, ZonesSubscriber};
 use scanhub_schema::{Scan, Status, Verdict};
 use scanhub_shm::{PortFactory, UpdateConnections};
 
@@ -19,9 +19,9 @@ fn is_readable(descriptor: &OwnedFd, longest: Duration) -> bool {
     poll(&mut fds, Some(&longest)).unwrap() == 1
 }
 
-fn scans(place: &Place) -> (Subscription<Scan>, OwnedFd) {
-    let scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
-    let mut scans = scans.wait_by(Wait::Event);
+fn scans(place: &Place) -> (Subscriber<Scan>, OwnedFd) {
+    let mut scans =
+        Subscriber::<Scan>::builder("front").in_domain(&place.domain).wait(Wait::Event).open().unwrap();
     let descriptor = scans.descriptor().unwrap().try_clone_to_owned().unwrap();
     (scans, descriptor)
 }
@@ -30,7 +30,7 @@ fn scans(place: &Place) -> (Subscription<Scan>, OwnedFd) {
 const LONG: Duration = Duration::from_secs(60);
 
 /// Polls until there is a scan.
-fn polled(scans: &mut Subscription<Scan>, descriptor: &OwnedFd) -> (u64, bool, usize) {
+fn polled(scans: &mut Subscriber<Scan>, descriptor: &OwnedFd) -> (u64, bool, usize) {
     let give_up_at = Instant::now() + LONG;
     loop {
         assert!(is_readable(descriptor, LONG) && Instant::now() < give_up_at);
@@ -43,7 +43,7 @@ fn polled(scans: &mut Subscription<Scan>, descriptor: &OwnedFd) -> (u64, bool, u
 #[test]
 fn a_bell_has_no_descriptor() {
     let place = Place::new();
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscriber::<Scan>::builder("front").in_domain(&place.domain).open().unwrap();
     let failure = scans.descriptor().unwrap_err();
     assert_eq!(failure.kind(), ErrorKind::InvalidInput);
     assert!(failure.remedy().contains("by event"), "{failure}");
@@ -97,8 +97,8 @@ fn what_a_late_joiner_is_handed_makes_it_readable() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     hub.front().status(|status| status.baud = 500_000);
-    let statuses = Subscription::<Status>::in_domain(place.places(), "front").unwrap();
-    let mut statuses = statuses.wait_by(Wait::Event);
+    let mut statuses =
+        Subscriber::<Status>::builder("front").in_domain(&place.domain).wait(Wait::Event).open().unwrap();
     let descriptor = statuses.descriptor().unwrap().try_clone_to_owned().unwrap();
     until("the status", || {
         hub.front().status.publisher.update_connections().unwrap();
@@ -111,9 +111,10 @@ fn what_a_late_joiner_is_handed_makes_it_readable() {
 fn a_verdict_that_gets_too_old_makes_it_readable() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap().wait_by(Wait::Event);
+    let mut zones =
+        ZonesSubscriber::builder("front").in_domain(&place.domain).wait(Wait::Event).open().unwrap();
     let descriptor = zones.descriptor().unwrap().try_clone_to_owned().unwrap();
-    let polled = |zones: &mut ZonesFollower| loop {
+    let polled = |zones: &mut ZonesSubscriber| loop {
         assert!(is_readable(&descriptor, LONG));
         if let Some(heard) = zones.try_next().unwrap() {
             return (heard.zones.verdict(), heard.stale);
@@ -123,7 +124,7 @@ fn a_verdict_that_gets_too_old_makes_it_readable() {
         let _ = zones.try_next().unwrap();
         hub.front().zones.service.dynamic_config().number_of_subscribers() == 1
     });
-    assert!(zones.hub_lives());
+    assert!(zones.hub_is_running());
     hub.front().zones(Verdict::Clear, 900);
     until("the verdict", || polled(&mut zones) == (Verdict::Clear, false));
     assert_eq!(polled(&mut zones), (Verdict::Unknown, true));

@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::{
-    ErrorKind, Event, Marks, PublishSession, Scan, Subscription, Topic, Tracks, Verdict, Wait, Wake, Zones,
+    ErrorKind, Event, Marks, PublishSession, Scan, Subscriber, SubscriberBuilder, Topic, Tracks, Verdict,
+    Wait, Wake, Zones,
 };
 use scanhub_schema::ScanHead;
 use scanhub_schema::limits::TopicLimits;
@@ -18,13 +19,17 @@ fn marks(count: u8) -> Marks {
 }
 
 /// What a consumer says of its next sample: missed, restarted, number, marks.
-fn next(followed: &mut Subscription<Marks>) -> (u64, bool, u64, u8) {
+fn next(followed: &mut Subscriber<Marks>) -> (u64, bool, u64, u8) {
     let sample = followed.next().unwrap().expect("a sample in time");
     (sample.missed, sample.restarted, sample.header().topic_seq, sample.count)
 }
 
-fn follow(place: &Place, sensor: &str) -> Subscription<Marks> {
-    Subscription::in_domain(place.places(), sensor).unwrap().timeout(Duration::from_secs(60))
+fn follow(place: &Place, sensor: &str) -> Subscriber<Marks> {
+    builder(place, sensor).open().unwrap()
+}
+
+fn builder(place: &Place, sensor: &str) -> SubscriberBuilder<Subscriber<Marks>> {
+    Subscriber::builder(sensor).in_domain(&place.domain).timeout(Duration::from_secs(60))
 }
 
 #[test]
@@ -34,8 +39,10 @@ fn it_is_followed_without_a_hub_and_what_is_skipped_is_missed() {
         let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
         assert_eq!(publisher(place.domain.root()), Ok(Some(std::process::id())));
         let mut near = session.sensor("tracker.near").unwrap().topic::<Marks>().unwrap();
-        let mut followed = follow(&place, "tracker.near").wait_by(wait);
-        assert!(followed.try_next().unwrap().is_none() && near.subscribers() == 1 && followed.hub_lives());
+        let mut followed = builder(&place, "tracker.near").wait(wait).open().unwrap();
+        assert!(
+            followed.try_next().unwrap().is_none() && near.subscribers() == 1 && followed.hub_is_running()
+        );
         for count in 0..3 {
             near.send(|sample| *sample = marks(count)).unwrap();
             assert_eq!(next(&mut followed), (0, false, count.into(), count));
@@ -67,7 +74,7 @@ fn samples_that_are_sent_together_wake_once() {
     sensor.wake(Wake::Telegram).unwrap();
     assert_eq!(next(&mut followed), (0, false, 0, 1));
     // Who comes later gets what the topic keeps.
-    let mut late = Subscription::<Zones>::in_domain(place.places(), "tracker.near").unwrap();
+    let mut late = Subscriber::<Zones>::builder("tracker.near").in_domain(&place.domain).open().unwrap();
     until("the last zones", || {
         zones.connect();
         late.try_next().unwrap().is_some_and(|zones| zones.verdict() == Verdict::Unknown)
@@ -121,9 +128,11 @@ fn telegrams_have_the_length_that_they_have() {
     let place = Place::new();
     let session = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut bytes = session.sensor("tracker.near").unwrap().topic::<[u8]>().unwrap();
-    let mut followed = Subscription::<[u8]>::in_domain(place.places(), "tracker.near")
-        .unwrap()
-        .timeout(Duration::from_secs(60));
+    let mut followed = Subscriber::<[u8]>::builder("tracker.near")
+        .in_domain(&place.domain)
+        .timeout(Duration::from_secs(60))
+        .open()
+        .unwrap();
     assert!(followed.try_next().unwrap().is_none());
     bytes.send_bytes(&[1, 2, 3]).unwrap();
     assert_eq!(*followed.next().unwrap().unwrap(), [1, 2, 3]);
@@ -150,8 +159,11 @@ fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
     }
     assert!(topic("tracker.near").is_ok() && session.check_room(&Topic::ALL).is_ok());
     // The hub goes on.
-    let scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
-    let mut scans = scans.timeout(Duration::from_secs(60));
+    let mut scans = Subscriber::<Scan>::builder("front")
+        .in_domain(&place.domain)
+        .timeout(Duration::from_secs(60))
+        .open()
+        .unwrap();
     assert!(scans.try_next().unwrap().is_none());
     hub.front().scan(&[1000]);
     assert_eq!(scans.next().unwrap().unwrap().beams(), 1);
@@ -181,9 +193,9 @@ fn programs_with_names_of_their_own_publish_at_once_with_a_hub_and_without() {
     for impossible in ["", "robot", "tracker.near"] {
         assert_eq!(beside(impossible).map(drop).unwrap_err().kind(), ErrorKind::InvalidInput, "{impossible}");
     }
-    let mut seen = Subscription::<Tracks>::in_domain(place.places(), "house").unwrap();
-    let mut happened = Subscription::<Event>::in_domain(place.places(), "yard").unwrap();
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut seen = Subscriber::<Tracks>::builder("house").in_domain(&place.domain).open().unwrap();
+    let mut happened = Subscriber::<Event>::builder("yard").in_domain(&place.domain).open().unwrap();
+    let mut scans = Subscriber::<Scan>::builder("front").in_domain(&place.domain).open().unwrap();
     assert!(seen.try_next().unwrap().is_none() && happened.try_next().unwrap().is_none());
     assert!(scans.try_next().unwrap().is_none());
     tracks.send(|_| {}).unwrap();
@@ -207,9 +219,11 @@ fn samples_of_any_length_ring_the_bell_of_those_who_sleep_at_it() {
     let session = PublishSession::open(&place.domain, &[Topic::Scan], TopicLimits::default()).unwrap();
     let sensor = session.sensor("tracker.near").unwrap();
     let mut scans = sensor.topic_for::<Scan>(&TopicLimits { beams: 2_160, ..*sensor.limits() }).unwrap();
-    let mut followed = Subscription::<Scan>::in_domain(place.places(), "tracker.near")
-        .unwrap()
-        .timeout(Duration::from_secs(60));
+    let mut followed = Subscriber::<Scan>::builder("tracker.near")
+        .in_domain(&place.domain)
+        .timeout(Duration::from_secs(60))
+        .open()
+        .unwrap();
     assert!(followed.try_next().unwrap().is_none());
     let node = scanhub_shm::client_node(&place.domain).unwrap();
     let bell = Bell::open(&node, "tracker.near").unwrap().expect("the sensor has one");

@@ -8,11 +8,11 @@ use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::{
-    Marks, Publication, PublishSession, Received, RobotFollower, Scan, SensorPublisher, Subscription,
-    ZonesFollower, streams,
+    Marks, Publication, PublishSession, Received, RobotSubscriber, Scan, SensorPublisher, Subscriber,
+    Telegram, ZonesSubscriber, streams,
 };
 use scanhub_schema::limits::BORROWED;
-use scanhub_shm::{LocalService, Payload, PortFactory, Role, Service, Subscriber, ThreadSafeService};
+use scanhub_shm::{LocalService, Payload, PortFactory, Role, Service, ThreadSafeService};
 
 /// Far longer than anything takes on a busy machine.
 const LONG: Duration = Duration::from_secs(60);
@@ -21,20 +21,20 @@ fn is_send<T: Send>() {}
 
 #[test]
 fn all_types_of_the_interface_are_send() {
-    is_send::<Subscription<Scan>>();
-    is_send::<Subscription<[u8]>>();
+    is_send::<Subscriber<Scan>>();
+    is_send::<Subscriber<Telegram>>();
     is_send::<Received<Scan>>();
     is_send::<Publication<Marks>>();
     is_send::<PublishSession>();
     is_send::<SensorPublisher>();
-    is_send::<ZonesFollower>();
-    is_send::<RobotFollower>();
+    is_send::<ZonesSubscriber>();
+    is_send::<RobotSubscriber>();
     is_send::<streams::Session>();
     is_send::<streams::Source>();
 }
 
 /// Attaches to the scans of `front` with ports of kind `S`.
-fn attach<S: Service>(place: &Place) -> (scanhub_shm::Node<S>, Subscriber<Scan, S>) {
+fn attach<S: Service>(place: &Place) -> (scanhub_shm::Node<S>, scanhub_shm::Subscriber<Scan, S>) {
     let node = scanhub_shm::join::<S>(&place.domain, Role::Subscriber).unwrap();
     let topic = Scan::open(&node, "front").unwrap().expect("the hub made it");
     let subscriber = Scan::subscriber(&node, &topic).unwrap();
@@ -64,7 +64,8 @@ fn both_kinds_of_service_attach_to_one_hub() {
 fn a_subscriber_and_its_samples_move_between_threads() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(LONG);
+    let mut scans =
+        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(LONG).open().unwrap();
     assert!(scans.try_next().unwrap().is_none());
     let (give, take) = mpsc::channel();
     let thread = thread::spawn(move || {
@@ -89,7 +90,8 @@ fn a_subscriber_and_its_samples_move_between_threads() {
 fn a_publication_moves_to_another_thread() {
     let place = Place::new();
     let mut near = Publication::<Marks>::in_domain(&place.domain, "tracker.near").unwrap();
-    let mut marks = Subscription::<Marks>::in_domain(place.places(), "tracker.near").unwrap().timeout(LONG);
+    let mut marks =
+        Subscriber::<Marks>::builder("tracker.near").in_domain(&place.domain).timeout(LONG).open().unwrap();
     until("the subscriber", || marks.try_next().unwrap().is_none() && near.subscribers() == 1);
     let near = thread::spawn(move || {
         near.send(|sample| *sample = Marks::default()).unwrap();

@@ -18,7 +18,7 @@ use iceoryx2::service::builder::publish_subscribe::{
 use iceoryx2::service::port_factory::publish_subscribe;
 
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Header, Kind, Topic, limits, of_service};
+use scanhub_schema::{Failure, Header, Kind, TelegramBytes, Topic, limits, of_service};
 
 use crate::doorbell::note_attached;
 use crate::processes::Node;
@@ -274,6 +274,21 @@ macro_rules! payloads {
 }
 
 scanhub_schema::for_each_topic!(payloads);
+
+// The bytes of a telegram with a name, for programs. The hub uses the bytes themselves.
+payload!(
+    TelegramBytes,
+    Topic::Telegram,
+    [u8],
+    len,
+    Box<TelegramBytes>,
+    TelegramBytes::zeroed(len),
+    |builder, limits| builder.initial_max_slice_len(limits.telegram),
+    |publisher| publisher.loan_slice(len),
+    TelegramBytes::of_bytes,
+    TelegramBytes::of_bytes_mut,
+    TelegramBytes::bytes
+);
 
 /// Returns the number of places for subscribers that `topic` was created with.
 pub fn places<P: Payload + ?Sized, S: Service>(topic: &TopicService<P, S>) -> usize {

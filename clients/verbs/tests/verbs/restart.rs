@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::child::{Child, spawn};
 use crate::echo::{Format, start};
 use crate::fake::{FakeHub, Place, until};
-use scanhub_client::Subscription;
+use scanhub_client::Subscriber;
 use scanhub_schema::Scan;
 use scanhub_shm::PortFactory;
 use scanhub_shm::{Domain, holder};
@@ -72,8 +72,8 @@ fn echo_goes_on_after_a_killed_hub() {
 #[test]
 fn a_subscription_says_that_the_hub_was_restarted() {
     let place = Place::new();
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
-    assert!(!scans.hub_lives() && scans.try_next().unwrap().is_none());
+    let mut scans = Subscriber::<Scan>::builder("front").in_domain(&place.domain).open().unwrap();
+    assert!(!scans.hub_is_running() && scans.try_next().unwrap().is_none());
     let hub = Hub::start(&place, 1);
     for _ in 0..5 {
         let scan = scans.next().unwrap().expect("without a timeout it waits");
@@ -95,8 +95,9 @@ fn a_subscription_times_out_and_goes_on() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     let timeout = Duration::from_millis(20);
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
-    until("nothing", || scans.next().unwrap().is_none() && scans.hub_lives());
+    let mut scans =
+        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(timeout).open().unwrap();
+    until("nothing", || scans.next().unwrap().is_none() && scans.hub_is_running());
     hub.front().scan.await_subscribers(1);
     hub.front().scan(&[7; 361]);
     let scan = scans.next().unwrap().expect("one was sent");
@@ -107,7 +108,7 @@ fn a_subscription_times_out_and_goes_on() {
 #[test]
 fn a_subscription_goes_on_after_a_hub_that_ended_well() {
     let place = Place::new();
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscriber::<Scan>::builder("front").in_domain(&place.domain).open().unwrap();
     for boot in 1..4 {
         let mut hub = FakeHub::new(&place.domain, &["front"], boot);
         until("the consumer", || {
@@ -128,8 +129,9 @@ fn a_client_that_comes_between_two_hubs() {
     until("its topics", || scanhub_shm::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
     hub.kill(&place);
     let timeout = Duration::from_millis(50);
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
-    assert!(scans.next().unwrap().is_none() && !scans.hub_lives());
+    let mut scans =
+        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(timeout).open().unwrap();
+    assert!(scans.next().unwrap().is_none() && !scans.hub_is_running());
     let hub = Hub::start(&place, 2);
     // It looks for a hub all the time, so it may come while the hub starts.
     let mut is_heard = false;
@@ -146,7 +148,7 @@ fn a_client_that_comes_between_two_hubs() {
 fn the_numbers_of_a_network_go_on_over_lives_of_a_hub() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    let mut scans = Subscriber::<Scan>::builder("front").in_domain(&place.domain).open().unwrap();
     assert!(scans.try_next().unwrap().is_none());
     hub.front().flags = scanhub_schema::Flags::REMOTE;
     let mut missed = |hub: &mut FakeHub, boot: u64, topic_seq: u64| {

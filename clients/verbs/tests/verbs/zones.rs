@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use crate::echo::{Format, start};
 use crate::fake::{FakeHub, FakeSensor, Place, Verb, until};
 use crate::{context, named};
-use scanhub_client::{ErrorKind, RobotFollower, ZonesFollower};
+use scanhub_client::{ErrorKind, RobotSubscriber, ZonesSubscriber};
 use scanhub_schema::Verdict;
 use scanhub_verbs::Bounds;
 use scanhub_verbs::hz::HzArgs;
@@ -32,7 +32,7 @@ fn until_heard(sensor: &mut FakeSensor, verdict: Verdict, mut heard: impl FnMut(
 fn a_silence_is_unknown_once() {
     let place = Place::new();
     let mut hub = slow_hub(&place, &["front"], 7);
-    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
     until_heard(hub.front(), Verdict::Clear, || {
         zones.try_next().unwrap().is_some_and(|heard| heard.zones.verdict() == Verdict::Clear)
     });
@@ -58,7 +58,7 @@ fn a_silence_is_unknown_once() {
 #[test]
 fn without_a_hub_and_after_one() {
     let place = Place::new();
-    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
     let heard = zones.next().unwrap();
     assert_eq!((heard.zones.verdict(), heard.stale, heard.header), (Verdict::Unknown, true, None));
     let mut hub = slow_hub(&place, &["front"], 1);
@@ -72,7 +72,7 @@ fn without_a_hub_and_after_one() {
 fn the_newest_counts_and_what_waited_is_no_news() {
     let place = Place::new();
     let mut hub = slow_hub(&place, &["front"], 1);
-    let mut zones = ZonesFollower::in_domain(place.places(), "front").unwrap();
+    let mut zones = ZonesSubscriber::builder("front").in_domain(&place.domain).open().unwrap();
     until_heard(hub.front(), Verdict::Clear, || zones.try_next().unwrap().is_some());
     while zones.try_next().unwrap().is_some() {}
     for nearest_mm in [300, 200, 100] {
@@ -131,7 +131,7 @@ fn echo_says_the_silence_too() {
 fn the_robot_is_the_worst_of_its_sensors() {
     let place = Place::new();
     let mut hub = slow_hub(&place, &["front", "rear"], 1);
-    let mut all = RobotFollower::in_domain(place.places(), &[]).unwrap();
+    let mut all = RobotSubscriber::builder(&[]).in_domain(&place.domain).open().unwrap();
     assert_eq!((all.now().unwrap().verdict(), all.now().unwrap().worst()), (Verdict::Unknown, None));
     let mut publish = |front: Verdict, rear: Option<Verdict>| {
         hub.sensors[0].zones(front, 900);
@@ -154,14 +154,14 @@ fn the_robot_is_the_worst_of_its_sensors() {
     assert_eq!(verdicts, [("front", Verdict::Clear), ("rear", Verdict::Unknown)]);
     assert_eq!((robot.worst(), robot.nearest()), (Some("rear"), Some((900, "front"))));
 
-    let mut named = RobotFollower::in_domain(place.places(), &["front", "left"]).unwrap();
+    let mut named = RobotSubscriber::builder(&["front", "left"]).in_domain(&place.domain).open().unwrap();
     until("the one that is there", || {
         publish(Verdict::Stop, Some(Verdict::Clear));
         named.next().unwrap().verdict() == Verdict::Stop
     });
     let verdicts: Vec<_> = named.now().unwrap().sensors().map(|(_, verdict)| verdict).collect();
     assert_eq!(verdicts, [Verdict::Stop, Verdict::Unknown], "never heard");
-    let refused = RobotFollower::in_domain(place.places(), &["robot"]).err();
+    let refused = RobotSubscriber::builder(&["robot"]).in_domain(&place.domain).open().err();
     assert_eq!(refused.map(|error| error.kind()), Some(ErrorKind::InvalidInput));
 }
 
