@@ -10,8 +10,8 @@ use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
 use crate::error::Error;
 use crate::session::Session;
 
-/// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four at a time, and none
-/// during a wait.
+/// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four samples of a
+/// subscriber at a time. They stay valid while it waits, and after the hub has ended.
 #[derive(Debug)]
 pub struct Received<P: Payload + ?Sized> {
     sample: Sample<P, ThreadSafeService>,

@@ -50,7 +50,7 @@ pub use follower::Received;
 pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};
 pub use robot::{Robot, RobotSubscriber, robot};
-pub use subscribe::{Subscriber, subscribe};
+pub use subscribe::{Iter, Subscriber, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesSubscriber, zones};
 

@@ -216,7 +216,7 @@ impl Session {
     }
 
     /// Sleeps until a sample was sent, at most until `until` and for 100 ms. Returns at once if one may have been sent
-    /// since the caller looked. Hold no sample during the call.
+    /// since the caller looked.
     ///
     /// # Errors
     ///

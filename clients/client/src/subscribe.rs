@@ -53,7 +53,7 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         Subscriber { session, follower: Follower::new(sensor), timeout }
     }
 
-    /// Waits for the next sample; `None` only after the timeout. Drop the sample before the next call.
+    /// Waits for the next sample; `None` only after the timeout. Up to four samples may be held while others are received.
     ///
     /// # Errors
     ///
@@ -61,7 +61,7 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers have run
     /// out. [`ErrorKind::Failed`](crate::ErrorKind) if the domain belongs to another user, or the topic has another
     /// layout.
-    #[allow(clippy::should_implement_trait)] // It returns errors apart from the end.
+    #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
     pub fn next(&mut self) -> Result<Option<Received<P>>, Error> {
         // A timeout beyond all time is none.
         let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
@@ -74,6 +74,32 @@ impl<P: Payload + ?Sized> Subscriber<P> {
             }
             self.session.wait(until)?;
         }
+    }
+
+    /// Returns an iterator over the samples, which waits for each of them. It ends after a silence of the timeout; a later
+    /// call continues.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::collections::VecDeque;
+    ///
+    /// use scanhub_client::{Error, Received, Scan, subscribe};
+    ///
+    /// fn main() -> Result<(), Error> {
+    ///     let mut last: VecDeque<Received<Scan>> = VecDeque::new();
+    ///     for scan in subscribe::<Scan>("front")?.iter() {
+    ///         // The last three scans, in the hub's memory.
+    ///         last.push_back(scan?);
+    ///         if last.len() > 3 {
+    ///             last.pop_front();
+    ///         }
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
+    pub fn iter(&mut self) -> Iter<'_, P> {
+        Iter(self)
     }
 
     /// Returns the next sample if one has arrived. It never waits.
@@ -130,5 +156,26 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         }
         self.session.look()?;
         self.follower.receive(&mut self.session)
+    }
+}
+
+impl<'a, P: Payload + ?Sized> IntoIterator for &'a mut Subscriber<P> {
+    type Item = Result<Received<P>, Error>;
+    type IntoIter = Iter<'a, P>;
+
+    fn into_iter(self) -> Iter<'a, P> {
+        self.iter()
+    }
+}
+
+/// Samples of a [`Subscriber`]. Up to four may be held; with four held, the iterator returns [`Error::TooManyHeld`] in
+/// place of the next sample, which stays in the queue.
+pub struct Iter<'a, P: Payload + ?Sized>(&'a mut Subscriber<P>);
+
+impl<P: Payload + ?Sized> Iterator for Iter<'_, P> {
+    type Item = Result<Received<P>, Error>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.0.next().transpose()
     }
 }

@@ -4,8 +4,9 @@ mod fake;
 
 use std::time::Duration;
 
-use fake::{FakeHub, Place};
-use scanhub_client::{ErrorKind, Scan, Subscriber, SubscriberBuilder, Telegram, Wait};
+use fake::{FakeHub, Place, until};
+use scanhub_client::{Error, ErrorKind, Scan, Subscriber, SubscriberBuilder, Telegram, Wait};
+use scanhub_schema::limits::BORROWED;
 
 /// Far longer than anything takes on a busy machine.
 const LONG: Duration = Duration::from_secs(60);
@@ -43,4 +44,67 @@ fn telegrams_are_bytes() {
     hub.front().telegram(&[2, 0x80, 7]);
     let telegram = telegrams.next().unwrap().expect("a telegram");
     assert_eq!((telegram.bytes(), telegram.len()), (&[2, 0x80, 7][..], 3));
+}
+
+#[test]
+fn samples_are_held_over_waits_and_the_fifth_is_too_many() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    for wait in [Wait::Doorbell, Wait::Event] {
+        let builder = Subscriber::<Scan>::builder("front").in_domain(&place.domain);
+        let mut scans = builder.timeout(LONG).wait(wait).open().unwrap();
+        assert!(scans.try_next().unwrap().is_none());
+        let mut held = Vec::new();
+        for beams in 1..=BORROWED {
+            hub.front().scan(&vec![1000; beams]);
+            held.push(scans.iter().next().expect("a scan").unwrap());
+        }
+        hub.front().scan(&[7]);
+        for _ in 0..2 {
+            let error = scans.iter().next().expect("an error").map(drop).unwrap_err();
+            assert!(matches!(error, Error::TooManyHeld), "{error}");
+        }
+        let beams: Vec<_> = held.iter().map(|scan| scan.beams()).collect();
+        assert_eq!(beams, [1, 2, 3, 4], "they have not changed");
+        held.pop();
+        let fifth = scans.next().unwrap().expect("the fifth was not lost");
+        assert_eq!((fifth.missed, fifth.distance_mm(0)), (0, Some(70)));
+    }
+}
+
+#[test]
+fn a_held_sample_stays_valid_after_the_hub_has_ended() {
+    let place = Place::new();
+    let mut scans =
+        Subscriber::<Scan>::builder("front").in_domain(&place.domain).timeout(LONG).open().unwrap();
+    let mut held = Vec::new();
+    for boot in 1..=2 {
+        let mut hub = FakeHub::new(&place.domain, &["front"], boot);
+        until("the subscriber", || {
+            assert!(scans.try_next().unwrap().is_none());
+            hub.front().scan.subscribers() == 1
+        });
+        hub.front().scan(&vec![1000; boot as usize]);
+        held.push(scans.next().unwrap().expect("a scan"));
+    }
+    let seen: Vec<_> = held.iter().map(|scan| (scan.header().boot, scan.beams())).collect();
+    assert_eq!(seen, [(1, 1), (2, 2)]);
+    assert!(held[1].restarted);
+}
+
+#[test]
+fn an_iterator_ends_after_a_silence_and_continues() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let builder = Subscriber::<Scan>::builder("front").in_domain(&place.domain);
+    let mut scans = builder.timeout(Duration::from_millis(20)).open().unwrap();
+    for _ in 0..2 {
+        assert!(scans.iter().next().is_none());
+        (0..3).for_each(|_| hub.front().scan(&[1000]));
+        let mut count = 0;
+        for scan in &mut scans {
+            count += scan.unwrap().beams();
+        }
+        assert_eq!(count, 3);
+    }
 }
