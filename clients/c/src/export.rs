@@ -74,7 +74,7 @@ fn open_robot(
 /// Returns the descriptor to poll.
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_fd(handle: *mut Opaque) -> c_int {
-    answer(|| with(handle, Handle::descriptor))
+    answer(|| with(handle, |handle: &mut Handle| handle.descriptor()))
 }
 
 /// Waits for a sample. Returns 1 if there is one, and 0 after the timeout.

@@ -16,10 +16,10 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Error, Heard, Payload, Publication, Received, Robot, RobotSubscriber, Subscriber, SubscriberBuilder,
-    Wait, ZonesSubscriber, publish_domain,
+    Error, Heard, Payload, Pollable, Publication, Received, Robot, RobotSubscriber, Subscriber,
+    SubscriberBuilder, Wait, ZonesSubscriber, publish_domain,
 };
-use scanhub_schema::{Header, Tilt, Topic, limits};
+use scanhub_schema::{Failure, Header, Kind, Tilt, Topic, limits};
 
 use crate::boundary::{CallError, Lent};
 
@@ -45,6 +45,31 @@ macro_rules! follower {
     };
 }
 
+/// Subscriber `T` that waits as the program has chosen. Only one that waits by event has a descriptor.
+enum Port<T> {
+    Sleeping(T),
+    Pollable(Pollable<T>),
+}
+
+impl<T> Port<T> {
+    fn get_mut(&mut self) -> &mut T {
+        match self {
+            Port::Sleeping(subscriber) => subscriber,
+            Port::Pollable(pollable) => pollable.get_mut(),
+        }
+    }
+
+    fn descriptor(&self) -> Result<c_int, Error> {
+        match self {
+            Port::Pollable(pollable) => Ok(pollable.as_raw_fd()),
+            Port::Sleeping(_) => {
+                let hint = "make it wait by event: a bell has no descriptor";
+                Err(Failure::new(Kind::Configuration, "no descriptor to wait on", hint).into())
+            }
+        }
+    }
+}
+
 /// Type of a sample of a topic.
 macro_rules! sample {
     (Zones $payload:tt) => {
@@ -58,7 +83,7 @@ macro_rules! sample {
 /// Declares the sources and samples from the table of topics. A robot combines the zones of its sensors.
 macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        enum Source { Robot(RobotSubscriber), $($topic(follower!($topic $payload)),)* }
+        enum Source { Robot(Port<RobotSubscriber>), $($topic(Port<follower!($topic $payload)>),)* }
 
         enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }
 
@@ -67,36 +92,40 @@ macro_rules! topics {
                 Ok(match topic {
                     $(Topic::$topic => {
                         let builder = <follower!($topic $payload)>::builder(sensor).wait(wait);
-                        Source::$topic(in_domain(builder, domain).open()?)
+                        let builder = in_domain(builder, domain);
+                        Source::$topic(match wait {
+                            Wait::Event => Port::Pollable(builder.open_pollable()?),
+                            _ => Port::Sleeping(builder.open()?),
+                        })
                     })*
                 })
             }
 
             fn try_next(&mut self) -> Result<Option<Held>, Error> {
                 Ok(match self {
-                    Source::Robot(robot) => robot.try_next()?.map(Told::new).map(Held::Robot),
-                    $(Source::$topic(topic) => topic.try_next()?.map(Held::$topic),)*
+                    Source::Robot(robot) => robot.get_mut().try_next()?.map(Told::new).map(Held::Robot),
+                    $(Source::$topic(topic) => topic.get_mut().try_next()?.map(Held::$topic),)*
                 })
             }
 
             fn wait(&mut self, longest: Duration) -> Result<(), Error> {
                 match self {
-                    Source::Robot(robot) => robot.wait(longest),
-                    $(Source::$topic(topic) => topic.wait(longest),)*
+                    Source::Robot(robot) => robot.get_mut().wait(longest),
+                    $(Source::$topic(topic) => topic.get_mut().wait(longest),)*
                 }
             }
 
-            fn descriptor(&mut self) -> Result<c_int, Error> {
-                Ok(match self {
-                    Source::Robot(robot) => robot.descriptor()?,
-                    $(Source::$topic(topic) => topic.descriptor()?,)*
-                }.as_raw_fd())
+            fn descriptor(&self) -> Result<c_int, Error> {
+                match self {
+                    Source::Robot(robot) => robot.descriptor(),
+                    $(Source::$topic(topic) => topic.descriptor(),)*
+                }
             }
 
-            fn hub_lives(&self) -> bool {
+            fn hub_lives(&mut self) -> bool {
                 match self {
-                    Source::Robot(robot) => robot.hub_is_running(),
-                    $(Source::$topic(topic) => topic.hub_is_running(),)*
+                    Source::Robot(robot) => robot.get_mut().hub_is_running(),
+                    $(Source::$topic(topic) => topic.get_mut().hub_is_running(),)*
                 }
             }
         }
@@ -158,7 +187,11 @@ impl Handle {
         early: bool,
     ) -> Result<Handle, CallError> {
         let robot = in_domain(RobotSubscriber::builder(sensors).wait(wait), domain);
-        Ok(Handle::of(Source::Robot(if early { robot.early() } else { robot }.open()?)))
+        let robot = if early { robot.early() } else { robot };
+        Ok(Handle::of(Source::Robot(match wait {
+            Wait::Event => Port::Pollable(robot.open_pollable()?),
+            _ => Port::Sleeping(robot.open()?),
+        })))
     }
 
     fn of(source: Source) -> Handle {
@@ -192,7 +225,7 @@ impl Handle {
         let held = match self.found.take() {
             // A verdict has no stamp, and the caller may have waited, so it must be current.
             Some(Held::Robot(found)) => match &mut self.source {
-                Source::Robot(robot) => Held::Robot(Told::new(robot.now()?)),
+                Source::Robot(robot) => Held::Robot(Told::new(robot.get_mut().now()?)),
                 _ => Held::Robot(found),
             },
             Some(held) => held,
@@ -216,13 +249,13 @@ impl Handle {
         Ok(())
     }
 
-    /// As [`Subscriber::descriptor`].
-    pub(crate) fn descriptor(&mut self) -> Result<c_int, CallError> {
+    /// Returns the descriptor of a handle that waits by event, as [`Pollable`] has it.
+    pub(crate) fn descriptor(&self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
 
     /// As [`Subscriber::hub_is_running`].
-    pub(crate) fn hub_lives(&self) -> bool {
+    pub(crate) fn hub_lives(&mut self) -> bool {
         self.source.hub_lives()
     }
 }

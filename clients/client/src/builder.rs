@@ -8,6 +8,7 @@ use scanhub_schema::check_followed;
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 
 use crate::error::Error;
+use crate::pollable::{Pollable, PollableSubscriber};
 use crate::robot::{RobotSource, RobotSubscriber};
 use crate::session::Session;
 use crate::subscribe::Subscriber;
@@ -115,6 +116,18 @@ impl<P: Payload + ?Sized> SubscriberBuilder<Subscriber<P>> {
     pub fn open(self) -> Result<Subscriber<P>, Error> {
         Ok(Subscriber::new(self.session()?, self.sensor(), self.timeout))
     }
+
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
+    /// [`wait`](Self::wait) says.
+    ///
+    /// # Errors
+    ///
+    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    pub fn open_pollable(self) -> Result<PollableSubscriber<P>, Error> {
+        let mut session = self.session()?;
+        let descriptor = session.pollable()?;
+        Ok(Pollable::new(descriptor, Subscriber::new(session, self.sensor(), self.timeout)))
+    }
 }
 
 impl SubscriberBuilder<ZonesSubscriber> {
@@ -125,6 +138,18 @@ impl SubscriberBuilder<ZonesSubscriber> {
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of the sensor or of the domain is invalid.
     pub fn open(self) -> Result<ZonesSubscriber, Error> {
         Ok(ZonesSubscriber::new(self.session()?, self.sensor()))
+    }
+
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
+    /// [`wait`](Self::wait) says.
+    ///
+    /// # Errors
+    ///
+    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    pub fn open_pollable(self) -> Result<Pollable<ZonesSubscriber>, Error> {
+        let mut session = self.session()?;
+        let descriptor = session.pollable()?;
+        Ok(Pollable::new(descriptor, ZonesSubscriber::new(session, self.sensor())))
     }
 }
 
@@ -141,10 +166,25 @@ impl SubscriberBuilder<RobotSubscriber> {
     ///
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of a sensor or of the domain is invalid.
     pub fn open(self) -> Result<RobotSubscriber, Error> {
-        let session = self.session()?;
+        Ok(RobotSubscriber::new(self.session()?, self.robot()))
+    }
+
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
+    /// [`wait`](Self::wait) says.
+    ///
+    /// # Errors
+    ///
+    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    pub fn open_pollable(self) -> Result<Pollable<RobotSubscriber>, Error> {
+        let mut session = self.session()?;
+        let descriptor = session.pollable()?;
+        Ok(Pollable::new(descriptor, RobotSubscriber::new(session, self.robot())))
+    }
+
+    fn robot(&self) -> RobotSource {
         let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
         let source = RobotSource::new(&sensors);
-        Ok(RobotSubscriber::new(session, if self.early { source.with_early() } else { source }))
+        if self.early { source.with_early() } else { source }
     }
 }
 

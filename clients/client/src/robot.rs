@@ -1,6 +1,5 @@
 //! The robot's verdict: its sensors' zones combined; a sensor without recent data counts as unknown.
 
-use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 use scanhub_schema::{Verdict, Zones, is_remote};
@@ -152,15 +151,6 @@ impl RobotSubscriber {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
-    }
-
-    /// Returns a descriptor to poll, as [`ZonesSubscriber::descriptor`](crate::ZonesSubscriber::descriptor).
-    ///
-    /// # Errors
-    ///
-    /// As [`Subscriber::descriptor`](crate::Subscriber::descriptor).
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
-        self.session.descriptor()
     }
 
     /// Returns whether a hub or a listener publishes in the domain, as of the last call of

@@ -3,6 +3,7 @@
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rustix::event::epoll;
@@ -174,28 +175,19 @@ impl Session {
         Some((rung, self.presence.looked_at()?))
     }
 
-    /// Returns a descriptor that is readable while there may be something to receive or to check. It stays the same
-    /// when the hub is replaced. From the first call on, only [`settle`](Self::settle) makes it unreadable.
+    /// Returns a descriptor that is readable while there may be something to receive or to check. The session waits by
+    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`settle`](Self::settle) makes it
+    /// unreadable. Call this before anything is followed.
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the session does not wait by event, [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors are short.
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
-        if self.wait != Wait::Event {
-            let hint = "make it wait by event: a bell has no descriptor";
-            return Err(Error::new(Kind::Configuration, "no descriptor to wait on", hint));
-        }
-        let readiness: &Readiness = match &mut self.readiness {
-            Some(readiness) => readiness,
-            none => {
-                let readiness = Readiness::new()?;
-                if let Some(joined) = &self.joined {
-                    joined.wakeups.descriptors().try_for_each(|event| readiness.add(event))?;
-                }
-                none.insert(readiness)
-            }
-        };
-        Ok(readiness.as_fd())
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    pub(crate) fn pollable(&mut self) -> Result<Arc<OwnedFd>, Error> {
+        self.wait = Wait::Event;
+        let readiness = Readiness::new()?;
+        let descriptor = readiness.descriptor.clone();
+        self.readiness = Some(readiness);
+        Ok(descriptor)
     }
 
     /// Notes that the caller has received all samples, and waits until `left` has passed. The descriptor, if
@@ -250,7 +242,7 @@ impl Session {
 /// Descriptor for programs that also wait for other things: an epoll over a timer and the events of each hub. It is
 /// readable while there may be something to receive or to check.
 struct Readiness {
-    descriptor: OwnedFd,
+    descriptor: Arc<OwnedFd>,
     clock: OwnedFd,
 }
 
@@ -259,7 +251,7 @@ impl Readiness {
     fn new() -> Result<Readiness, Error> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
-        let descriptor = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?;
+        let descriptor = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?);
         let readiness = Readiness { descriptor, clock };
         readiness.add(readiness.clock.as_fd())?;
         readiness.again_in(Duration::ZERO)?;
@@ -286,12 +278,6 @@ impl Readiness {
     }
 }
 
-impl AsFd for Readiness {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.descriptor.as_fd()
-    }
-}
-
 fn short(error: Errno) -> Error {
     let what = format!("no descriptor to wait on: {error}");
     Error::new(Kind::Short, what, "`ulimit -n` may be too small").with_source(io::Error::from(error))
@@ -304,7 +290,7 @@ mod tests {
     use std::io::{Write, pipe};
 
     fn is_readable(readiness: &Readiness, within: Duration) -> bool {
-        let mut fds = [PollFd::new(readiness, PollFlags::IN)];
+        let mut fds = [PollFd::new(&readiness.descriptor, PollFlags::IN)];
         let within = Timespec { tv_sec: within.as_secs() as i64, tv_nsec: within.subsec_nanos().into() };
         poll(&mut fds, Some(&within)).unwrap() == 1
     }

@@ -1,7 +1,6 @@
 //! Subscribes to one topic of one sensor, without copies. Waits for a hub that does not run yet, and continues when
 //! the hub is restarted.
 
-use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 use scanhub_shm::Payload;
@@ -126,19 +125,6 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(longest))
-    }
-
-    /// Returns a descriptor to poll, never to read. It can be readable although no sample has arrived: every second, ten
-    /// times a second while there is no hub, and when another topic of the sensor has a sample. It stays the same for as
-    /// long as the subscriber exists, even if the hub restarts. While it is readable, `poll` returns at once, until
-    /// [`try_next`](Self::try_next) returns `None`.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) without [`Wait::Event`](crate::Wait),
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
-        self.session.descriptor()
     }
 
     /// Returns whether a hub runs in the domain, as of the last call of [`next`](Self::next) or

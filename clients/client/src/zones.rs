@@ -2,7 +2,6 @@
 //! The verdict expires here, whether the sensor, the hub or the machine has stopped. A program that acts on it needs no
 //! timeout.
 
-use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use scanhub_schema::{Early, Flags, Header, Verdict, Zones};
@@ -100,16 +99,6 @@ impl ZonesSubscriber {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
         self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
-    }
-
-    /// Returns a descriptor to poll, as [`Subscriber::descriptor`](crate::Subscriber::descriptor), with
-    /// [`try_next`](Self::try_next) of the zones; it gets readable also when the verdict becomes too old.
-    ///
-    /// # Errors
-    ///
-    /// As [`Subscriber::descriptor`](crate::Subscriber::descriptor).
-    pub fn descriptor(&mut self) -> Result<BorrowedFd<'_>, Error> {
-        self.session.descriptor()
     }
 
     /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or

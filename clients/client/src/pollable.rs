@@ -1,0 +1,126 @@
+//! Subscribers for programs that also wait for other things: with a descriptor for `poll`, `epoll` or an executor.
+
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use scanhub_shm::Payload;
+
+use crate::error::Error;
+use crate::follower::Received;
+use crate::robot::{Robot, RobotSubscriber};
+use crate::subscribe::Subscriber;
+use crate::zones::{Heard, ZonesSubscriber};
+
+/// [`Subscriber`] with a descriptor. [`SubscriberBuilder::open_pollable`](crate::SubscriberBuilder) creates it.
+///
+/// # Examples
+///
+/// ```no_run
+/// use rustix::event::{PollFd, PollFlags, poll};
+/// use scanhub_client::{Scan, Subscriber};
+///
+/// let scans = Subscriber::<Scan>::builder("front").open_pollable()?;
+/// let stdin = std::io::stdin();
+/// loop {
+///     let mut fds = [PollFd::new(&scans, PollFlags::IN), PollFd::new(&stdin, PollFlags::IN)];
+///     poll(&mut fds, None)?;
+///     while let Some(scan) = scans.try_next()? {
+///         println!("{} beams", scan.beams());
+///     }
+///     if !fds[1].revents().is_empty() {
+///         return Ok(());
+///     }
+/// }
+/// # #[allow(unreachable_code)]
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub type PollableSubscriber<P> = Pollable<Subscriber<P>>;
+
+/// Subscriber with a descriptor that is readable while there may be something to take. Poll it, never read it. While it
+/// is readable, `poll` returns at once, until `try_next` returns `None`.
+///
+/// It can be readable although nothing has arrived: once a second while a hub runs, and when another topic of the
+/// sensor has a sample. The descriptor stays the same for the subscriber's life, even if the hub restarts, and a
+/// program that the process starts does not inherit it.
+pub struct Pollable<T> {
+    descriptor: Arc<OwnedFd>,
+    // A lock, so that `try_next` works while an executor borrows the descriptor.
+    subscriber: Mutex<T>,
+}
+
+impl<T> Pollable<T> {
+    pub(crate) fn new(descriptor: Arc<OwnedFd>, subscriber: T) -> Pollable<T> {
+        Pollable { descriptor, subscriber: Mutex::new(subscriber) }
+    }
+
+    /// Returns the subscriber, for example to wait with its `next`.
+    pub fn get_mut(&mut self) -> &mut T {
+        self.subscriber.get_mut().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn locked(&self) -> MutexGuard<'_, T> {
+        self.subscriber.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<T> AsFd for Pollable<T> {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.descriptor.as_fd()
+    }
+}
+
+impl<T> AsRawFd for Pollable<T> {
+    fn as_raw_fd(&self) -> RawFd {
+        self.descriptor.as_raw_fd()
+    }
+}
+
+impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
+    /// Returns the next sample if one has arrived. It never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscriber::next`].
+    pub fn try_next(&self) -> Result<Option<Received<P>>, Error> {
+        self.locked().try_next()
+    }
+
+    /// As [`Subscriber::hub_is_running`].
+    pub fn hub_is_running(&self) -> bool {
+        self.locked().hub_is_running()
+    }
+}
+
+impl Pollable<ZonesSubscriber> {
+    /// Returns the news, if there are any since the last call. It never waits. The descriptor becomes readable when the
+    /// verdict becomes too old, too.
+    ///
+    /// # Errors
+    ///
+    /// As [`ZonesSubscriber::next`].
+    pub fn try_next(&self) -> Result<Option<Heard>, Error> {
+        self.locked().try_next()
+    }
+
+    /// As [`ZonesSubscriber::hub_is_running`].
+    pub fn hub_is_running(&self) -> bool {
+        self.locked().hub_is_running()
+    }
+}
+
+impl Pollable<RobotSubscriber> {
+    /// Returns what is known now, if anything has changed since the last call. It never waits. The descriptor becomes
+    /// readable when a verdict becomes too old, too.
+    ///
+    /// # Errors
+    ///
+    /// As [`RobotSubscriber::next`].
+    pub fn try_next(&self) -> Result<Option<Robot>, Error> {
+        Ok(self.locked().try_next()?.cloned())
+    }
+
+    /// As [`RobotSubscriber::hub_is_running`].
+    pub fn hub_is_running(&self) -> bool {
+        self.locked().hub_is_running()
+    }
+}
