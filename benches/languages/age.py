@@ -3,10 +3,8 @@ sample was in hand: `aged SENSOR NS`. Arguments are domain, sensor and count."""
 
 import sys
 import time
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "clients/python"))
-import scanhub  # noqa: E402
+import scanhub
 
 domain, sensor, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
 ages = []

@@ -1,23 +1,23 @@
-//! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is
-//! compared with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
+//! The Python package next to a hub. Scripts check what only Python can see, and the tests compare the samples that they follow
+//! with those of `echo`. The tests skip if there is no Python with the package of this commit.
 
 use std::collections::BTreeMap;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit::{
-    INT, KILL, Outcome, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, python, until,
+    INT, KILL, Outcome, Program, Sender, TERM, TestEnv, client_python, in_a_network, is_class, number,
+    output, python, skip, until,
 };
 use scanhub_schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
 /// A script of the package's tests, if there is a Python for it.
 fn check(name: &str) -> Option<Command> {
-    let mut command = python("iceoryx2, numpy")?;
-    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
-    command.arg(package.join("tests").join(name).with_extension("py"));
-    command.env("PYTHONPATH", package).env_remove("SCANHUB_DOMAIN");
+    let mut command = client_python()?;
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
+    command.arg(scripts.join(name).with_extension("py")).env_remove("SCANHUB_DOMAIN");
     Some(command)
 }
 
@@ -43,22 +43,9 @@ fn streaming(env: &TestEnv) -> (Program, Program) {
 }
 
 #[test]
-fn structs_are_golden() {
-    let Some(mut command) = check("layouts") else { return };
+fn samples_of_golden_bytes_are_read() {
+    let Some(mut command) = check("samples") else { return };
     command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/v2"));
-    passed(command);
-}
-
-#[test]
-fn verdicts_grow_stale() {
-    let Some(command) = check("freshness") else { return };
-    passed(command);
-}
-
-#[test]
-fn early_warnings_count_as_in_rust() {
-    let Some(mut command) = check("early") else { return };
-    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/early.txt"));
     passed(command);
 }
 
@@ -83,6 +70,76 @@ fn names_of_their_own_come_and_go() {
     let Some(command) = check_on(&env, "own_names") else { return };
     passed(command);
     assert_eq!(env.left_behind(), Vec::<std::path::PathBuf>::new());
+}
+
+/// As a user without Rust and without a network.
+#[test]
+fn wheel_installs_without_compiler_and_network() {
+    let Some(python) = client_python() else { return };
+    let wheels = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/python/wheels");
+    let wheels = std::fs::read_dir(wheels).into_iter().flatten().flatten().map(|entry| entry.path());
+    let wheels: Vec<_> = wheels.filter(|path| path.extension().is_some_and(|it| it == "whl")).collect();
+    if wheels.len() != 2 {
+        skip(
+            "python-packages",
+            "there are no wheels of scanhub-client and numpy: clients/python/build.sh makes them",
+        );
+        return;
+    }
+    let env = TestEnv::new();
+    let run = |mut command: Command| {
+        let output =
+            output(command.env("PATH", "/usr/bin:/bin").env_remove("PYTHONPATH")).expect("it starts");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    };
+    let place = env.path("empty");
+    let mut make = Command::new(python.get_program());
+    make.args(["-m", "venv"]).arg(&place);
+    run(make);
+    let empty = place.join("bin/python");
+    let mut install = Command::new(&empty);
+    install.args(["-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]).args(&wheels);
+    run(install);
+    let mut scripts = Command::new(&empty);
+    scripts.args(["-c", "import scanhub, scanhub_lan; scanhub_lan.Guard"]);
+    run(scripts);
+    let size = |path: &PathBuf| std::fs::metadata(path).expect("a wheel").len();
+    let own = wheels.iter().find(|path| path.to_string_lossy().contains("scanhub_client"));
+    assert!(own.map(size).is_some_and(|bytes| bytes < 8_000_000), "{wheels:?}");
+    let _running = streaming(&env);
+    let readme = include_str!("../../clients/python/README.md");
+    let example = readme.split("```python\n").nth(1).and_then(|text| text.split("```").next());
+    let mut command = Command::new(empty);
+    command.args(["-u", "-c", example.expect("an example")]).env("SCANHUB_DOMAIN", env.place().name());
+    command
+        .env("RUNTIME_DIRECTORY", env.place().root().parent().expect("a base"))
+        .env_remove("XDG_RUNTIME_DIR");
+    command.env("PATH", "/usr/bin:/bin");
+    let mut example = Program::start(command);
+    let line = example.next_text();
+    assert!(line.ends_with(" m"), "{line}");
+}
+
+/// The stubs have all names and types of the module, and the examples use them as declared.
+#[test]
+fn types_are_those_of_the_stubs() {
+    if python("mypy").is_none() || client_python().is_none() {
+        return;
+    }
+    let env = TestEnv::new();
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
+    let [config, examples] =
+        ["pyproject.toml", "examples"].map(|name| package.join(name).display().to_string());
+    let strict = ["mypy", "--strict", "--config-file", &config];
+    for words in [
+        &[&strict[..], &[&examples]].concat()[..],
+        &["mypy", "--strict", "-p", "scanhub"],
+        &["mypy.stubtest", "scanhub"],
+    ] {
+        let mut command = client_python().expect("as before");
+        let output = output(command.arg("-m").args(words).current_dir(env.path(""))).expect("it starts");
+        assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stdout));
+    }
 }
 
 #[test]

@@ -12,7 +12,7 @@ use scanhub_schema::{
 };
 use serde_json::{Value, json};
 
-use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, in_a_network, number, python, until};
+use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, client_python, in_a_network, number, until};
 
 /// What turns a mount and what makes points of it, in one program.
 pub(crate) struct Made {
@@ -125,12 +125,12 @@ fn echo_python_and_a_recording_say_the_same() {
     let _hub = hub(&env);
     let mut made = Made::beside(&env);
     let mut echo = env.echo(&TOPICS);
-    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
-    let mut follower = python("iceoryx2, numpy").map(|mut command| {
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/tests");
+    let mut follower = client_python().map(|mut command| {
         let place = env.place();
         let root = place.root().parent().expect("a domain is below its base");
-        command.arg(package.join("tests/follow.py")).arg(place.name()).arg(root).args(TOPICS);
-        command.env("PYTHONPATH", &package).env_remove("SCANHUB_DOMAIN");
+        command.arg(scripts.join("follow.py")).arg(place.name()).arg(root).args(TOPICS);
+        command.env_remove("SCANHUB_DOMAIN");
         Program::start(command)
     });
     let file = env.word("tilted.mcap");

@@ -44,7 +44,7 @@ pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
 pub(crate) use program::{HUP, INT, KILL, Outcome, Program, TERM, USR1};
-pub(crate) use python::{python, python_for};
+pub(crate) use python::{client_python, python, python_for};
 pub(crate) use receiver::{Receiver, read};
 pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;

@@ -1,10 +1,11 @@
 //! A Python interpreter with the modules that a test needs.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
 
 use super::child::succeeds;
-use super::skip;
+use super::{output, skip};
 
 /// Returns a command that starts a Python with `modules`: that of `SCANHUB_PYTHON`, or the one that `.ci/run`
 /// installs. If there is none, skips the test and returns `None`.
@@ -24,4 +25,36 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     let mut command = Command::new(python);
     command.arg("-B");
     Some(command)
+}
+
+/// Returns a command that starts a Python with the package `scanhub` of this version and commit. If there is none, skips the
+/// test and returns `None`.
+pub(crate) fn client_python() -> Option<Command> {
+    static FOUND: OnceLock<String> = OnceLock::new();
+    let command = python_for("python-packages", "numpy")?;
+    let found = FOUND.get_or_init(|| {
+        let mut ask = Command::new(command.get_program());
+        ask.args(["-B", "-c", "import scanhub; print(scanhub.__version__, scanhub.__commit__)"]);
+        text(ask)
+    });
+    let mut git = Command::new("git");
+    let commit = text({
+        git.args(["rev-parse", "HEAD"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+        git
+    });
+    let commit = if commit.is_empty() { "unknown" } else { &commit };
+    let expected = format!("{} {commit}", env!("CARGO_PKG_VERSION"));
+    if *found != expected {
+        let python = command.get_program().display();
+        let what = format!("{python} has the package {found:?} in place of {expected:?}");
+        skip("python-packages", format!("{what}: clients/python/build.sh makes it"));
+        return None;
+    }
+    Some(command)
+}
+
+/// Returns what a program prints in one line; empty if it fails.
+fn text(mut command: Command) -> String {
+    let output = output(command.stderr(Stdio::null())).ok().filter(|output| output.status.success());
+    output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned()).unwrap_or_default()
 }

@@ -9,8 +9,6 @@ import time
 from dataclasses import asdict
 
 import scanhub
-from scanhub.names import TopicName
-from scanhub.warned import Said
 
 
 def say(line: dict) -> None:
@@ -33,15 +31,6 @@ refused(lambda: scanhub.robot("robot"))
 with scanhub.robot(domain=domain, root=root) as asked:
     assert asked.now() == scanhub.Robot() and asked.now().verdict == "unknown", "nobody was heard yet"
 assert asked.now() == scanhub.Robot() and list(asked) == [], "it was closed"
-
-with scanhub.robot(domain=domain, root=root) as crowd:
-    crowd._follow = crowd._followers.append
-    for sensor in range(1000):
-        crowd._meet(TopicName(f"robot{sensor}.front", "zones"))
-    assert len(crowd._followers) == 16 and len(crowd._heard) == 17, "of other machines' sensors no more are followed"
-    crowd._heard.update({sensor: Said("clear", None) for sensor in crowd._silent})
-    assert (crowd._fold().verdict, crowd._fold().worst) == ("unknown", "others..."), "and one stands for the others"
-    crowd._followers.clear()
 
 if sensors == ["--asked"]:
     robot = scanhub.robot(domain=domain, root=root)

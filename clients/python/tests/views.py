@@ -1,7 +1,12 @@
-"""Where the arrays of a sample lie, and how long they stay: arguments are domain and root. `front` has to stream."""
+"""Checks memory and lifetime of arrays, and threads, tasks and processes: arguments are domain and root. `front` has to
+stream."""
 
+import asyncio
 import gc
+import multiprocessing
 import os
+import pickle
+import signal
 import sys
 import threading
 import time
@@ -118,22 +123,151 @@ def what_is_closed_ends(scans: scanhub.Subscription) -> None:
     assert list(scans) == [] and np.array_equal(kept, before)
 
 
-def a_subscriber_announces_itself(scans: scanhub.Subscription) -> None:
-    def attached() -> int:
-        with open(f"/dev/shm/{scans._membership.prefix}front.bell", "rb") as page:
-            return int.from_bytes(page.read(8)[4:], sys.byteorder)
+def copies_can_be_pickled_and_views_cannot(scans: scanhub.Subscription) -> None:
+    scan = next(scans)
+    said = refuses(TypeError, lambda: pickle.dumps(scan))
+    assert "copy()" in said, said
+    copy = pickle.loads(pickle.dumps(scan.copy()))
+    assert type(copy) is scanhub.Scan and repr(copy) == repr(scan) and copy.stamp_ns == scan.stamp_ns
+    assert np.array_equal(copy.ranges, scan.ranges) and copy.codes == scan.codes and copy.flags == scan.flags
+    for broken in (b"", b"123", bytes(65)):
+        refuses(ValueError, lambda: scanhub._scanhub._restore("front", "marks", bytes(64), broken, (0, False, False)))
 
+
+def other_threads_drop_samples(scans: scanhub.Subscription) -> None:
+    for _ in range(5):
+        kept = [next(scans) for _ in range(4)]
+        views = [scan.ranges for scan in kept]
+        thread = threading.Thread(target=lambda: (kept.clear(), views.clear()))
+        thread.start()
+        thread.join()
+        # Four places are free again.
+        kept = [next(scans) for _ in range(4)]
+        kept.clear()
+
+
+def a_sample_is_dropped_while_another_thread_waits(scans: scanhub.Subscription) -> None:
+    with scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20) as own:
+        kept = [next(own) for _ in range(4)]
+        held = []
+
+        def take() -> None:
+            try:
+                next(own)
+            except scanhub.Held:
+                held.append(True)
+
+        thread = threading.Thread(target=take)
+        thread.start()
+        kept.clear()
+        thread.join()
+        next(own)
+
+
+def two_threads_at_a_time_are_refused(scans: scanhub.Subscription) -> None:
+    nothing = scanhub.subscribe("nobody/scan", domain=domain, root=root, timeout=1)
+    begun = threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        refuses(scanhub.Silent, lambda: next(nothing))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    begun.wait()
+    time.sleep(0.2)
+    said = refuses(scanhub.Failure, lambda: next(nothing))
+    assert "another thread" in said, said
+    thread.join()
+    # One after the other may use it.
     next(scans)
-    before = attached()
-    with scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20) as others:
-        next(others)
-        # The subscriber, and the listener of the event.
-        assert attached() == before + 2
+    thread = threading.Thread(target=lambda: next(scans))
+    thread.start()
+    thread.join()
+
+
+def ctrl_c_ends_a_wait(_: scanhub.Subscription) -> None:
+    nothing = scanhub.subscribe("nobody/scan", domain=domain, root=root)
+    took = []
+    for _ in range(5):
+        sent = []
+        timer = threading.Timer(0.3, lambda: (sent.append(time.monotonic()), os.kill(os.getpid(), signal.SIGINT)))
+        timer.start()
+        refuses(KeyboardInterrupt, lambda: next(nothing))
+        took.append(time.monotonic() - sent[0])
+        timer.join()
+    assert min(took) < 0.2, took
+
+
+def asyncio_waits_without_a_thread(_: scanhub.Subscription) -> None:
+    async def follow() -> None:
+        scans = scanhub.subscribe("front/scan", "front/zones", domain=domain, root=root, timeout=20)
+        threads, seen, canceled, last = threading.active_count(), 0, 0, None
+        while seen < 100 or canceled < 50:
+            try:
+                sample = await asyncio.wait_for(scans.__anext__(), 0.003)
+            except asyncio.TimeoutError:
+                canceled += 1
+                continue
+            if sample.topic == "scan":
+                assert last is None or sample.topic_seq == last + 1 + sample.missed
+                assert sample.missed == 0 or canceled > 10_000, "a canceled wait lost a sample"
+                last, seen = sample.topic_seq, seen + 1
+        assert threading.active_count() == threads
+        async for verdict in scanhub.robot(domain=domain, root=root):
+            assert verdict.sensors
+            break
+        silent = scanhub.subscribe("nobody/scan", domain=domain, root=root, timeout=0.3)
+        try:
+            await silent.__anext__()
+            raise AssertionError("there is no such sensor")
+        except scanhub.Silent as said:
+            assert "nobody/scan" in said.message
+        closed = scanhub.subscribe("front/scan", domain=domain, root=root)
+        closed.close()
+        assert [scan async for scan in closed] == []
+
+    asyncio.run(follow())
+
+
+def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
+    next(scans)
+
+    async def follow() -> None:
+        async for _ in scans:
+            raise AssertionError("it was used by `for` before")
+
+    said = refuses(scanhub.Failure, lambda: asyncio.run(follow()))
+    assert "async for" in said, said
+
+
+def a_child_of_multiprocessing_takes_nothing(scans: scanhub.Subscription) -> None:
+    scan = next(scans)
+    kept, before = scan.ranges, scan.ranges.copy()
+    children = multiprocessing.get_context("fork")
+    for _ in range(2):
+        child = children.Process(target=lambda: sys.exit(0 if kept[0] == before[0] else 1))
+        child.start()
+        child.join()
+        assert child.exitcode == 0
+    for _ in range(20):
+        next(scans)
+    assert np.array_equal(kept, before)
+
+
+def a_child_is_refused(scans: scanhub.Subscription) -> None:
+    next(scans)
+    child = os.fork()
+    if child == 0:
+        said = refuses(scanhub.Failure, lambda: next(scans))
+        scans.close()
+        os._exit(0 if "parent" in said else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    next(scans)
 
 
 domain, root = sys.argv[1:]
 for check in (
-    a_subscriber_announces_itself,
     views_are_the_hubs_memory,
     views_cannot_be_written,
     a_view_keeps_its_sample,
@@ -141,6 +275,15 @@ for check in (
     other_threads_run_meanwhile,
     a_child_takes_nothing_from_its_parent,
     what_is_closed_ends,
+    copies_can_be_pickled_and_views_cannot,
+    other_threads_drop_samples,
+    a_sample_is_dropped_while_another_thread_waits,
+    two_threads_at_a_time_are_refused,
+    ctrl_c_ends_a_wait,
+    asyncio_waits_without_a_thread,
+    a_subscription_has_one_kind_of_loop,
+    a_child_of_multiprocessing_takes_nothing,
+    a_child_is_refused,
 ):
     check(scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20))
     print(check.__name__, flush=True)

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::blocks::Block;
 use crate::client_c::installed::Installed;
-use crate::testkit::{TestEnv, output, python};
+use crate::testkit::{TestEnv, client_python, output, python};
 
 /// Something to start.
 pub(crate) struct Example {
@@ -48,7 +48,6 @@ impl Example {
         command.env("SCANHUB_DOMAIN", env.place().name()).env("PYTHONWARNINGS", "error");
         command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
         command.env("PYTHONUNBUFFERED", "1").env("PYTHONDONTWRITEBYTECODE", "1");
-        command.env("PYTHONPATH", Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python"));
         command
     }
 }
@@ -67,12 +66,11 @@ fn whole(block: &Block) -> String {
 }
 
 fn of_python(block: &Block, source: &Path) -> Option<Example> {
-    let modules = match &block.text {
-        text if text.contains("rosbags") => "rosbags",
-        text if text.contains("mcap") => "mcap, mcap_ros2",
-        _ => "iceoryx2, numpy",
-    };
-    let python = python(modules)?;
+    let python = match &block.text {
+        text if text.contains("rosbags") => python("rosbags"),
+        text if text.contains("mcap") => python("mcap, mcap_ros2"),
+        _ => client_python(),
+    }?;
     let (place, text) = (block.place.clone(), block.text.clone());
     let program = PathBuf::from(python.get_program());
     Some(Example { place, text, program, arguments: vec![source.to_owned()] })

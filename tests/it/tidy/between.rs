@@ -272,9 +272,13 @@ fn the_ends_of_a_network_only_compute() {
 }
 
 #[test]
-fn the_library_for_c_knows_clients() {
-    holds(crates::the_library_for_c_knows_clients, |tree| {
+fn the_libraries_for_c_and_python_know_clients() {
+    holds(crates::the_libraries_for_c_and_python_know_clients, |tree| {
+        let python = "clients/python/Cargo.toml";
         vec![
+            tree.with_line(python, "[dependencies]", "scanhub-drivers.workspace = true"),
+            tree.with_line(python, "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with_line("clients/verbs/Cargo.toml", "[dependencies]", "scanhub-python.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),

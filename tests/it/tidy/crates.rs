@@ -471,18 +471,20 @@ fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
     others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
-/// The library for C is a face of the attach library: it knows nothing else, and nothing is built with it.
-pub(crate) fn the_library_for_c_knows_clients(tree: &Tree) -> Vec<String> {
-    const OWN: &str = "scanhub-c";
+/// Finds what the libraries for C and for Python use besides the client library, and crates that are built with them.
+pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &Tree) -> Vec<String> {
     let members = tree.members();
-    let known = ["scanhub-client", "scanhub-schema"];
-    let mut breaches: Vec<String> =
-        built_with(&members[OWN]).filter(|name| !known.contains(&name.as_str())).cloned().collect();
-    let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
-    let all = members.into_iter().chain([top]);
-    breaches.extend(all.filter_map(|(name, manifest)| {
-        built_with(&manifest).any(|known| known == OWN).then(|| format!("{name} is built with it"))
-    }));
+    let mut breaches = Vec::new();
+    for (own, others) in [("scanhub-c", &[][..]), ("scanhub-python", &["bytemuck", "pyo3"])] {
+        let known = [&["scanhub-client", "scanhub-schema"], others].concat();
+        let is_known = |name: &&String| known.contains(&name.as_str());
+        breaches.extend(built_with(&members[own]).filter(|name| !is_known(name)).cloned());
+        let top = ("scanhub".to_owned(), tree.manifest("Cargo.toml"));
+        let all = members.clone().into_iter().chain([top]);
+        breaches.extend(all.filter_map(|(name, manifest)| {
+            built_with(&manifest).any(|known| known == own).then(|| format!("{name} is built with {own}"))
+        }));
+    }
     breaches
 }
 
@@ -548,14 +550,18 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
     };
     let mut wanted = list("members");
     wanted.insert(".".to_owned());
-    // Whoever builds the hub does not build Zenoh.
-    let apart = wanted.take("clients/bridge");
+    // The hub is built without Zenoh, and without Python.
+    let apart = ["clients/bridge", "clients/python"].map(|member| wanted.take(member));
     let mut breaches: Vec<String> = wanted
         .difference(&list("default-members"))
         .map(|member| format!("{member} is no default member"))
         .collect();
-    if apart.is_some() {
+    if apart.iter().all(Option::is_some) {
         breaches.extend(lacks(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
+        // The tests of the package use what this builds.
+        if !tree.text(".ci/run").contains("step clients/python/build.sh") {
+            breaches.push(".ci/run does not build clients/python".to_owned());
+        }
     }
     breaches
 }

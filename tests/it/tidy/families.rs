@@ -5,7 +5,7 @@ use super::holds;
 use super::tree::{Tree, code};
 
 /// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 10] = [
+const MAY: [&str; 9] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
@@ -17,7 +17,6 @@ const MAY: [&str; 10] = [
     "schema/src/file/layout.txt",
     "clients/c/include/scanhub/attach.h",
     "clients/c/scanhub.h",
-    "clients/python/scanhub/scan.py",
     "clients/python/scanhub_lan.py",
     "clients/wireshark/scanhub.lua",
 ];

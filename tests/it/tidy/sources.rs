@@ -20,7 +20,7 @@ pub(crate) fn only_the_demonstration_of_the_program_reads_clocks(tree: &Tree) ->
 }
 
 /// Files that may hold unsafe code, each for something that no safe crate offers.
-const UNSAFE: [&str; 8] = [
+const UNSAFE: [&str; 9] = [
     // A page that hub and consumers map.
     "schema/shm/src/doorbell.rs",
     // The descriptors that wake consumers.
@@ -36,11 +36,13 @@ const UNSAFE: [&str; 8] = [
     "clients/c/src/boundary.rs",
     // Names of functions as the linker of such programs looks for them; no block.
     "clients/c/src/export.rs",
+    // A subscription that moves between threads of Python, and views of its samples.
+    "clients/python/src/client.rs",
     // An allocator that counts.
     "hub/daemon/tests/counting/mod.rs",
 ];
 /// In what is shipped: tests and benches are listed and explained like all, and not counted.
-const MOST_UNSAFE_BLOCKS: usize = 10;
+const MOST_UNSAFE_BLOCKS: usize = 12;
 
 pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
     let mut breaches =

@@ -1,0 +1,273 @@
+"""Samples of a scanhub on this machine, from shared memory and without a copy.
+
+    import scanhub
+
+    for scan in scanhub.subscribe("front/scan"):
+        print(scan.seq, scan.ranges_m[180])
+
+`scan.ranges_m` has meters, NaN without a reading. `scan.ranges` is a read-only numpy view of the hub's memory, in device units
+and with codes. A subscription waits for a hub that does not run yet, and continues after its restart. `scanhub.robot()`
+follows the verdict of all sensors, and `scanhub.publish("mount/tilt")` publishes the angles of a mount. docs/python.md
+describes the rest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from typing import Any, Callable
+
+from . import _scanhub
+from ._scanhub import (
+    Background,
+    Cloud,
+    Early,
+    Event,
+    Foreground,
+    Lines,
+    Marks,
+    Motion,
+    Obstacles,
+    Publication,
+    Sample,
+    Scan,
+    Status,
+    Telegram,
+    Tilt,
+    Tracks,
+    Zones,
+    __commit__ as __commit__,
+    __version__ as __version__,
+)
+from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent, Taken
+from .values import (
+    CLASSES,
+    Corner,
+    Line,
+    Mark,
+    Obstacle,
+    Place,
+    Pose,
+    Robot,
+    Segment,
+    Site,
+    Step,
+    TopicName,
+    Track,
+    Zone,
+)
+
+__all__ = [
+    "CLASSES",
+    "Background",
+    "Cloud",
+    "Corner",
+    "Denied",
+    "Early",
+    "Event",
+    "Failure",
+    "Foreground",
+    "Held",
+    "Impossible",
+    "Line",
+    "Lines",
+    "Mark",
+    "Marks",
+    "Mismatch",
+    "Motion",
+    "NoHub",
+    "NoTopic",
+    "Obstacle",
+    "Obstacles",
+    "Place",
+    "Pose",
+    "Publication",
+    "Refused",
+    "Robot",
+    "RobotFollower",
+    "Sample",
+    "Scan",
+    "Segment",
+    "Short",
+    "Shown",
+    "Silent",
+    "Site",
+    "Status",
+    "Step",
+    "Subscription",
+    "Taken",
+    "Telegram",
+    "Tilt",
+    "TopicName",
+    "Track",
+    "Tracks",
+    "Zone",
+    "Zones",
+    "background",
+    "control",
+    "publish",
+    "robot",
+    "sensors",
+    "subscribe",
+    "topics",
+]
+
+def _release_names() -> None:
+    """Closes the locks of names that the parent publishes. A child that kept them would keep the names after the parent was
+    killed."""
+    for descriptor in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            _, name = os.path.split(os.readlink(f"/proc/self/fd/{descriptor}"))
+            if name.startswith("name.") and name.endswith(".lock"):
+                os.close(int(descriptor))
+
+
+os.register_at_fork(after_in_child=_release_names)
+
+Shown = Background
+"""A background model that the hub sends on request."""
+
+
+async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any:
+    """Waits for the next item. A task that is canceled meanwhile loses none: each is received just before the return."""
+    loop = asyncio.get_running_loop()
+    until = None if follower._timeout is None else loop.time() + follower._timeout
+    while follower._is_open:
+        descriptor = follower._descriptor()
+        item = follower._poll()
+        if item is not None:
+            return item
+        if until is not None and loop.time() >= until:
+            raise follower._silence()
+        await _readable(loop, descriptor, until)
+    raise StopAsyncIteration
+
+
+async def _readable(loop: asyncio.AbstractEventLoop, descriptor: int, until: float | None) -> None:
+    ready = loop.create_future()
+
+    def wake() -> None:
+        if not ready.done():
+            ready.set_result(None)
+
+    loop.add_reader(descriptor, wake)
+    timer = None if until is None else loop.call_at(until, wake)
+    try:
+        await ready
+    finally:
+        loop.remove_reader(descriptor)
+        if timer is not None:
+            timer.cancel()
+
+
+class Subscription(_scanhub.Subscription):
+    """Iterates over the samples of its topics, with `for` or with `async for`. Made by `scanhub.subscribe`. The iteration ends
+    only if the subscription is closed."""
+
+    def __aiter__(self) -> Subscription:
+        return self
+
+    async def __anext__(self) -> Any:
+        return await _next(self)
+
+    def __enter__(self) -> Subscription:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class RobotFollower(_scanhub.RobotFollower):
+    """Iterates over the verdicts of the robot, with `for` or with `async for`. Made by `scanhub.robot`. The iteration ends only
+    if it is closed."""
+
+    def __aiter__(self) -> RobotFollower:
+        return self
+
+    async def __anext__(self) -> Robot:
+        verdict: Robot = await _next(self)
+        return verdict
+
+    def __enter__(self) -> RobotFollower:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def subscribe(
+    *topics: str,
+    domain: str | None = None,
+    root: str | os.PathLike[str] | None = None,
+    timeout: float | None = None,
+    on_notice: Callable[[str], object] | None = None,
+) -> Subscription:
+    """Subscribes to `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN, or
+    `scanhub`) below the directory `root` (None: all locations in which a hub may be).
+
+    Iterate over the result. With `timeout`, a silence of this number of seconds raises NoHub or Silent. `on_notice` is called
+    with `hub_gone` and `hub_back`. Raises NoTopic or Impossible if a name is invalid.
+    """
+    return Subscription(topics, domain, root, timeout, on_notice)
+
+
+def robot(
+    *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
+) -> RobotFollower:
+    """Follows the verdict over the zones of `sensors`. Without names, it follows all sensors of the hub; in a domain without
+    a hub, those of other machines that are published there. With `early`, the verdict becomes worse before a scan is complete,
+    and better again if the warning is withdrawn.
+
+    Iterate over the result, or call `now()` in a loop of your own. The verdict becomes `unknown` if no recent data arrives.
+    Raises Impossible if a name is invalid.
+    """
+    return RobotFollower(sensors, domain, root, early)
+
+
+def publish(
+    topic: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
+) -> Publication:
+    """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`. No hub is needed. The name has no dot.
+
+    Raises Taken if another process publishes as NAME, a program or the hub; Impossible if the name or the topic is invalid;
+    Denied, Short, Mismatch or Failure.
+    """
+    return Publication(topic, domain, root)
+
+
+def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:
+    """Returns the topics of the running hub, sorted. Raises NoHub after half a second."""
+    return sorted(TopicName(*name) for name in _scanhub._topics(domain, root))
+
+
+def sensors(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[str]:
+    """Returns the sensors of the running hub, sorted. Raises NoHub after half a second."""
+    return sorted({topic.sensor for topic in topics(domain=domain, root=root)})
+
+
+def background(
+    sensor: str, order: str = "show", *, domain: str | None = None, root: str | os.PathLike[str] | None = None
+) -> Background:
+    """Returns the background model of `sensor`, after `order` was carried out: `show`, `reset` (learn again), `freeze` or
+    `thaw`. Raises Refused if the hub refuses it, NoTopic if there is no such sensor, NoHub, Silent or Short."""
+    _check_order(order, ("show", "reset", "freeze", "thaw"))
+    if order != "show":
+        _scanhub._request(sensor, order, domain, root)
+    model = _scanhub._request(sensor, "show", domain, root)
+    if model is None:
+        raise Failure("the hub's answer has no model", "hub and client are of different versions")
+    return model
+
+
+def control(
+    sensor: str, order: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
+) -> None:
+    """Lets the hub `pause` a sensor, `resume` it, or restart its session (`resync`). Raises as `background` does."""
+    _check_order(order, ("pause", "resume", "resync"))
+    _scanhub._request(sensor, order, domain, root)
+
+
+def _check_order(order: str, orders: tuple[str, ...]) -> None:
+    if order not in orders:
+        raise Impossible(f"no order {order!r}", f"there are {', '.join(orders)}")

@@ -1,0 +1,623 @@
+//! The only contact with the client library: subscriptions to several topics or to the verdict of a robot, and the samples
+//! that a program keeps.
+//!
+//! Ports and samples of the client library belong to one thread. A program may use a subscription, and drop its samples, in any
+//! thread. So a subscription and all samples that it received are behind one mutex.
+#![allow(unsafe_code)]
+
+use std::mem;
+use std::path::PathBuf;
+use std::process;
+use std::ptr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, Who, find};
+use scanhub_client::{
+    Domain, Environment, Failure, Header, Kind, Publication, Robot, RobotFollower, Tilt, Topic, Wait,
+};
+use scanhub_schema::limits;
+
+use crate::error::Error;
+
+/// Maximum time of one wait. After it, the caller handles signals.
+const LONGEST_WAIT: Duration = Duration::from_millis(100);
+
+/// Topic of a sensor.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Name {
+    pub(crate) sensor: Arc<str>,
+    pub(crate) topic: Topic,
+}
+
+/// Domain as the program names it.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Place {
+    pub(crate) domain: Option<String>,
+    pub(crate) root: Option<PathBuf>,
+}
+
+impl Place {
+    /// Returns the locations in which the domain may be.
+    pub(crate) fn candidates(&self) -> Result<Vec<Domain>, Error> {
+        let base = self.root.as_deref().map(std::path::absolute).transpose();
+        let base = base.map_err(|error| Error::new("Impossible", format!("root: {error}"), ""))?;
+        Ok(Domain::candidates(&self.name(), base.as_deref(), &Environment::of_process())?)
+    }
+
+    /// Returns the location of the running hub.
+    pub(crate) fn live(&self) -> Result<Domain, Error> {
+        find(&self.candidates()?).map_err(Error::of_hub)
+    }
+
+    /// Returns the location in which a program publishes.
+    fn home(&self) -> Result<Domain, Error> {
+        match self.root {
+            Some(_) => Ok(self.candidates()?.remove(0)),
+            None => Ok(scanhub_client::home(self.domain.as_deref())?),
+        }
+    }
+
+    fn name(&self) -> String {
+        let of_process = || std::env::var("SCANHUB_DOMAIN");
+        let name = self.domain.clone().or_else(|| of_process().ok());
+        name.unwrap_or_else(|| scanhub_client::DEFAULT_DOMAIN.to_owned())
+    }
+}
+
+/// Value that stays where it is used by one thread at a time, and that a child after `fork` neither uses nor drops, because it
+/// belongs to the parent.
+pub(crate) struct Confined<T> {
+    value: Mutex<Option<T>>,
+    process: u32,
+    busy: AtomicBool,
+}
+
+// SAFETY: The value is reached only through the mutex, and nothing outside of it shares its reference counts: the session,
+// its ports and the samples that they received are parts of one value. None of them depends on the thread that created it.
+unsafe impl<T> Send for Confined<T> {}
+// SAFETY: As above.
+unsafe impl<T> Sync for Confined<T> {}
+
+impl<T> Confined<T> {
+    pub(crate) fn new(value: T) -> Confined<T> {
+        Confined { value: Mutex::new(Some(value)), process: process::id(), busy: AtomicBool::new(false) }
+    }
+
+    /// Reserves the value for one thread until the result is dropped.
+    pub(crate) fn reserve(&self) -> Result<Reserved<'_>, Error> {
+        if !self.is_own() {
+            let remedy = "a child process after a fork makes its own";
+            return Err(Error::new("Failure", "this object belongs to the parent process", remedy));
+        }
+        if self.busy.swap(true, Ordering::Acquire) {
+            let remedy = "make one for each thread";
+            return Err(Error::new("Failure", "another thread or task uses this object", remedy));
+        }
+        Ok(Reserved(&self.busy))
+    }
+
+    /// Returns whether this process created the value.
+    pub(crate) fn is_own(&self) -> bool {
+        self.process == process::id()
+    }
+
+    /// Calls `apply` with the value, after other threads have finished with it. `None` if it was taken or belongs to the parent.
+    pub(crate) fn with<R>(&self, apply: impl FnOnce(&mut T) -> R) -> Option<R> {
+        // A thread of the parent may have held the lock at the fork.
+        if self.is_own() { self.lock().as_mut().map(apply) } else { None }
+    }
+
+    /// Calls `apply` with the value, unless another thread uses it.
+    fn try_with(&self, apply: impl FnOnce(&mut T)) {
+        if let Ok(mut value) = self.value.try_lock() {
+            value.as_mut().map(apply);
+        }
+    }
+
+    /// Takes the value, if this process created it.
+    pub(crate) fn take(&self) -> Option<T> {
+        if self.is_own() { self.lock().take() } else { None }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Option<T>> {
+        self.value.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<T> Drop for Confined<T> {
+    fn drop(&mut self) {
+        if !self.is_own() {
+            mem::forget(self.value.get_mut().unwrap_or_else(PoisonError::into_inner).take());
+        }
+    }
+}
+
+/// Reservation of a [`Confined`] value.
+pub(crate) struct Reserved<'a>(&'a AtomicBool);
+
+impl Drop for Reserved<'_> {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::Release);
+    }
+}
+
+/// A source of items, with or without a descriptor to poll.
+pub(crate) trait Follow: Sized {
+    /// Received item.
+    type Item;
+
+    /// Returns the next item that has arrived.
+    fn try_next(this: &Arc<Confined<Self>>) -> Result<Option<Self::Item>, Error>;
+
+    /// Sleeps until an item may have arrived, at most for `longest` and 0.1 s.
+    fn wait(&mut self, longest: Duration) -> Result<(), Error>;
+
+    /// Uses events from now on, and returns the descriptor to poll.
+    fn descriptor(&mut self) -> Result<i32, Error>;
+
+    /// Returns whether the program has closed it.
+    fn has_left(&self) -> bool {
+        false
+    }
+
+    /// Returns whether a hub or listener publishes in the domain, as of the last look.
+    fn hub_lives(&self) -> bool;
+
+    /// Returns the changes of the hub since the last call, oldest first.
+    fn notices(&mut self) -> Vec<&'static str> {
+        Vec::new()
+    }
+
+    /// Returns the error after a silence of `timeout`.
+    fn silence(&self, timeout: f64) -> Error {
+        Error::new("Silent", format!("no verdict in {timeout} s"), "")
+    }
+}
+
+/// Subscription to one or more topics.
+pub(crate) struct Topics {
+    session: Session,
+    places: Vec<Domain>,
+    sources: Vec<Followed>,
+    /// Index of the source that is next in the round, so that no topic waits for the samples of another one.
+    turn: usize,
+    wait: Option<Wait>,
+    /// Samples that the program keeps, with the indexes of their sources.
+    kept: Vec<Option<(usize, AnySample)>>,
+    /// Indexes of the kept samples that the program has dropped.
+    dropped: Arc<Mutex<Vec<usize>>>,
+    notices: Vec<&'static str>,
+    has_left: bool,
+}
+
+struct Followed {
+    name: Name,
+    source: Source,
+    last: Header,
+    is_first: bool,
+}
+
+/// A received sample.
+pub(crate) struct Received {
+    pub(crate) name: Name,
+    /// Header of the sample. In a silence of zones, that of the last sample.
+    pub(crate) header: Header,
+    pub(crate) missed: u64,
+    pub(crate) restarted: bool,
+    /// Whether zones are unknown because no recent data arrived.
+    pub(crate) stale: bool,
+    pub(crate) payload: Payload,
+}
+
+/// Payload of a received sample.
+pub(crate) enum Payload {
+    Held(Held),
+    Own(Vec<u8>),
+}
+
+impl Topics {
+    pub(crate) fn new(names: Vec<Name>, place: &Place) -> Result<Topics, Error> {
+        let places = place.candidates()?;
+        let sources = names.into_iter().map(|name| {
+            let source = Source::new(&name.sensor, name.topic);
+            Followed { name, source, last: Header::default(), is_first: true }
+        });
+        Ok(Topics {
+            session: Session::new(places.clone()),
+            places,
+            sources: sources.collect(),
+            turn: 0,
+            wait: None,
+            kept: Vec::new(),
+            dropped: Arc::default(),
+            notices: Vec::new(),
+            has_left: false,
+        })
+    }
+
+    /// Ends the subscription. Samples that the program keeps stay.
+    pub(crate) fn leave(&mut self) {
+        self.has_left = true;
+        self.sources.clear();
+        self.session = Session::new(Vec::new());
+    }
+
+    /// Gives the samples back to the hub that the program has dropped.
+    fn give_back(&mut self) {
+        for number in self.dropped.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+            self.kept[number] = None;
+        }
+    }
+
+    fn look_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
+        loop {
+            // Samples that have arrived come first, because a look for the hub takes longer than receiving.
+            if let Some(received) = self.receive(true)? {
+                return Ok(Some(received));
+            }
+            let Change { gone, back } = self.session.look()?;
+            self.notices.extend(gone.filter(|who| *who == Who::Hub).map(|_| "hub_gone"));
+            self.notices.extend(back.filter(|who| *who == Who::Hub).map(|_| "hub_back"));
+            if self.session.domain().is_none()
+                && let Some(denied) = Error::denied(self.session.no_hub_here())
+            {
+                return Err(denied);
+            }
+            if let Some(received) = self.receive(false)? {
+                return Ok(Some(received));
+            }
+            if self.wait != Some(Wait::Event) || !self.session.settle(self.left())? {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn receive(&mut self, only_subscribed: bool) -> Result<Option<(usize, AnySample)>, Error> {
+        for _ in 0..self.sources.len() {
+            let index = self.turn;
+            self.turn = (index + 1) % self.sources.len();
+            let source = &mut self.sources[index].source;
+            if only_subscribed && !source.subscribed() {
+                continue;
+            }
+            match source.receive(&mut self.session) {
+                Ok(None) => {}
+                Ok(Some(sample)) => return Ok(Some((index, sample))),
+                Err(_) if self.kept_of(index) >= limits::BORROWED => {
+                    let Name { sensor, topic } = &self.sources[index].name;
+                    let what = format!(
+                        "four samples of {sensor}/{} are kept, and no more are possible",
+                        topic.name()
+                    );
+                    return Err(Error::new(
+                        "Held",
+                        what,
+                        "drop them and their views, or keep `sample.copy()`",
+                    ));
+                }
+                Err(failure) => return Err(failure.into()),
+            }
+        }
+        Ok(None)
+    }
+
+    fn kept_of(&self, source: usize) -> usize {
+        self.kept.iter().flatten().filter(|(of, _)| *of == source).count()
+    }
+
+    fn keep(&mut self, source: usize, sample: AnySample) -> usize {
+        let free = self.kept.iter().position(Option::is_none).unwrap_or_else(|| {
+            self.kept.push(None);
+            self.kept.len() - 1
+        });
+        self.kept[free] = Some((source, sample));
+        free
+    }
+
+    fn left(&self) -> Option<Duration> {
+        self.sources.iter().filter_map(|followed| followed.source.left()).min()
+    }
+}
+
+impl Follow for Topics {
+    type Item = Received;
+
+    fn has_left(&self) -> bool {
+        self.has_left
+    }
+
+    fn try_next(this: &Arc<Confined<Topics>>) -> Result<Option<Received>, Error> {
+        let mut value = this.lock();
+        let Some(topics) = value.as_mut() else { return Ok(None) };
+        topics.wait = topics.wait.or(Some(Wait::Doorbell));
+        topics.give_back();
+        let Some((index, sample)) = topics.look_and_receive()? else { return Ok(None) };
+        let followed = &mut topics.sources[index];
+        let header = sample.header().copied();
+        let restarted = header.is_some_and(|header| !followed.is_first && header.boot != followed.last.boot);
+        if let Some(header) = header {
+            (followed.last, followed.is_first) = (header, false);
+        }
+        let (name, header) = (followed.name.clone(), followed.last);
+        let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(heard) if heard.stale));
+        let payload = match &sample {
+            // The client library has a copy already.
+            AnySample::Zones(_) => Payload::Own(sample.bytes().to_vec()),
+            _ => {
+                let bytes = sample.bytes();
+                let (address, len) = (bytes.as_ptr().expose_provenance(), bytes.len());
+                let is_of_words = matches!(
+                    sample,
+                    AnySample::Scan(_)
+                        | AnySample::Foreground(_)
+                        | AnySample::Background(_)
+                        | AnySample::Cloud(_)
+                );
+                let number = topics.keep(index, sample);
+                let dropped = Arc::clone(&topics.dropped);
+                Payload::Held(Held { address, len, is_of_words, number, dropped, of: Arc::clone(this) })
+            }
+        };
+        Ok(Some(Received { name, header, missed, restarted, stale, payload }))
+    }
+
+    fn wait(&mut self, longest: Duration) -> Result<(), Error> {
+        let longest = longest.min(LONGEST_WAIT);
+        Ok(self.session.wait_for(Some(self.left().map_or(longest, |left| left.min(longest))))?)
+    }
+
+    fn descriptor(&mut self) -> Result<i32, Error> {
+        if self.wait.is_none() {
+            let session = mem::replace(&mut self.session, Session::new(Vec::new()));
+            (self.session, self.wait) = (session.by(Wait::Event), Some(Wait::Event));
+        }
+        if self.wait != Some(Wait::Event) {
+            return Err(Error::mixed());
+        }
+        Ok(number_of(self.session.descriptor()?))
+    }
+
+    fn hub_lives(&self) -> bool {
+        self.session.domain().is_some()
+    }
+
+    fn notices(&mut self) -> Vec<&'static str> {
+        mem::take(&mut self.notices)
+    }
+
+    fn silence(&self, timeout: f64) -> Error {
+        if self.session.domain().is_none() {
+            return Error::of_hub(self.session.no_hub());
+        }
+        let names = |is_listed: fn(&&Followed) -> bool| {
+            let names = self
+                .sources
+                .iter()
+                .filter(is_listed)
+                .map(|followed| format!("{}/{}", followed.name.sensor, followed.name.topic.name()));
+            let mut names: Vec<String> = names.collect();
+            names.sort();
+            names.join(", ")
+        };
+        let missing = names(|followed| !followed.source.subscribed());
+        if !missing.is_empty() {
+            let topics = scanhub_client::live_topics(&self.places).join(", ");
+            let topics = if topics.is_empty() { "no topics at all" } else { &topics };
+            return Error::new(
+                "Silent",
+                format!("no {missing} in {timeout} s"),
+                format!("the hub has {topics}"),
+            );
+        }
+        let sensor = self.sources.first().map_or("SENSOR", |followed| &followed.name.sensor);
+        let remedy = format!("`scanhub info {sensor}` shows the sensor's state");
+        Error::new("Silent", format!("nothing of {} in {timeout} s", names(|_| true)), remedy)
+    }
+}
+
+/// Payload of a sample in shared memory. The sample is given back to the hub when this is dropped.
+pub(crate) struct Held {
+    /// Address of the payload.
+    address: usize,
+    len: usize,
+    /// Whether the payload has a variable length.
+    is_of_words: bool,
+    number: usize,
+    dropped: Arc<Mutex<Vec<usize>>>,
+    of: Arc<Confined<Topics>>,
+}
+
+impl Held {
+    /// Returns the used bytes of the payload.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.words()[..self.len]
+    }
+
+    /// Returns the used bytes, and those that fill the last word of a payload of variable length.
+    pub(crate) fn words(&self) -> &[u8] {
+        let len = if self.is_of_words { self.len.next_multiple_of(8) } else { self.len };
+        // SAFETY: `of` keeps the sample until `self` is dropped. Until then, its payload in shared memory does not move, and
+        // the hub does not write it. A payload of variable length consists of whole words of 8 bytes.
+        unsafe { std::slice::from_raw_parts(ptr::with_exposed_provenance(self.address), len) }
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        if self.of.is_own() {
+            self.dropped.lock().unwrap_or_else(PoisonError::into_inner).push(self.number);
+            // A thread that waits gives it back after the wait.
+            self.of.try_with(Topics::give_back);
+        }
+    }
+}
+
+/// Subscription to the verdict of a robot.
+pub(crate) struct Verdicts {
+    robot: RobotFollower,
+    wait: Option<Wait>,
+}
+
+/// Verdict of a robot, by value.
+pub(crate) struct Verdict {
+    pub(crate) verdict: &'static str,
+    pub(crate) worst: Option<String>,
+    pub(crate) nearest: Option<(u32, String)>,
+    pub(crate) sensors: Vec<(String, &'static str)>,
+}
+
+impl Default for Verdict {
+    /// Returns the verdict of a robot without sensors.
+    fn default() -> Verdict {
+        verdict(&Robot::default())
+    }
+}
+
+impl Verdicts {
+    pub(crate) fn new(sensors: &[&str], place: &Place, early: bool) -> Result<Verdicts, Error> {
+        let robot = RobotFollower::in_domain(place.candidates()?, sensors)?;
+        Ok(Verdicts { robot: if early { robot.with_early() } else { robot }, wait: None })
+    }
+
+    /// Returns what is known now. Never waits.
+    pub(crate) fn now(&mut self) -> Result<Verdict, Error> {
+        Ok(verdict(self.robot.now()?))
+    }
+}
+
+impl Follow for Verdicts {
+    type Item = Verdict;
+
+    fn try_next(this: &Arc<Confined<Verdicts>>) -> Result<Option<Verdict>, Error> {
+        let mut value = this.lock();
+        let Some(verdicts) = value.as_mut() else { return Ok(None) };
+        verdicts.wait = verdicts.wait.or(Some(Wait::Doorbell));
+        Ok(verdicts.robot.try_next()?.map(verdict))
+    }
+
+    fn wait(&mut self, longest: Duration) -> Result<(), Error> {
+        Ok(self.robot.wait(longest.min(LONGEST_WAIT))?)
+    }
+
+    fn descriptor(&mut self) -> Result<i32, Error> {
+        if self.wait.is_none() {
+            // Nothing was received, so another follower misses nothing.
+            let none = RobotFollower::in_domain(Vec::new(), &[])?;
+            let robot = mem::replace(&mut self.robot, none);
+            (self.robot, self.wait) = (robot.wait_by(Wait::Event), Some(Wait::Event));
+        }
+        if self.wait != Some(Wait::Event) {
+            return Err(Error::mixed());
+        }
+        Ok(number_of(self.robot.descriptor()?))
+    }
+
+    fn hub_lives(&self) -> bool {
+        self.robot.hub_lives()
+    }
+}
+
+fn verdict(robot: &Robot) -> Verdict {
+    Verdict {
+        verdict: robot.verdict().name(),
+        worst: robot.worst().map(str::to_owned),
+        nearest: robot.nearest().map(|(mm, sensor)| (mm, sensor.to_owned())),
+        sensors: robot.sensors().map(|(sensor, verdict)| (sensor.to_owned(), verdict.name())).collect(),
+    }
+}
+
+fn number_of(descriptor: std::os::fd::BorrowedFd<'_>) -> i32 {
+    use std::os::fd::AsRawFd;
+    descriptor.as_raw_fd()
+}
+
+/// Published angles of a mount.
+pub(crate) struct Mount(Publication<Tilt>);
+
+impl Mount {
+    pub(crate) fn new(name: &str, place: &Place) -> Result<Mount, Error> {
+        Publication::in_domain(&place.home()?, name).map(Mount).map_err(Error::of_name)
+    }
+
+    /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
+    pub(crate) fn send(&mut self, stamp_ns: Option<u64>, tilt: Tilt) -> Result<(), Error> {
+        let fill = |sample: &mut Tilt| *sample = tilt;
+        Ok(match stamp_ns {
+            None => self.0.send(fill),
+            Some(stamp_ns) => self.0.send_at(stamp_ns, fill),
+        }?)
+    }
+
+    /// Returns the number of subscribers.
+    pub(crate) fn subscribers(&self) -> usize {
+        self.0.connect();
+        self.0.subscribers()
+    }
+}
+
+/// Returns the topics of the running hub, sorted.
+pub(crate) fn topics(place: &Place) -> Result<Vec<(String, String)>, Error> {
+    let names = scanhub_client::live_topics(&[place.live()?]);
+    let names = names.iter().filter_map(|name| name.split_once('/'));
+    Ok(names.map(|(sensor, topic)| (sensor.to_owned(), topic.to_owned())).collect())
+}
+
+impl From<Failure> for Error {
+    fn from(failure: Failure) -> Error {
+        let class = match failure.kind {
+            Kind::NoHub => "NoHub",
+            Kind::NoTopic => "NoTopic",
+            Kind::Short => "Short",
+            Kind::Configuration | Kind::Usage => "Impossible",
+            Kind::NameHeld | Kind::DomainHeld => "Taken",
+            Kind::Timeout => "Silent",
+            // The client library has no kinds for these yet.
+            _ if failure.message.contains("belongs to user") => "Denied",
+            _ if failure.message.contains("another layout") || failure.message.contains("iceoryx2") => {
+                "Mismatch"
+            }
+            _ => "Failure",
+        };
+        Error::new(class, failure.message, failure.hint)
+    }
+}
+
+impl Error {
+    /// Returns the error for a hub that was not found.
+    pub(crate) fn of_hub(failure: Failure) -> Error {
+        let Failure { message, hint, .. } = &failure;
+        match message.contains("belongs to user") {
+            true => Error::new("Denied", message, hint),
+            false => failure.into(),
+        }
+    }
+
+    /// Returns the error for a domain that belongs to another user. `None` for another failure.
+    fn denied(failure: Failure) -> Option<Error> {
+        let error = Error::of_hub(failure);
+        (error.class == "Denied").then_some(error)
+    }
+
+    /// Returns the error for a name under which the program cannot publish.
+    fn of_name(failure: Failure) -> Error {
+        match failure.message.contains("is published by") {
+            true => Error::new("Taken", failure.message, failure.hint),
+            false => failure.into(),
+        }
+    }
+
+    /// Returns the error for a request that the hub refused.
+    pub(crate) fn of_request(failure: Failure) -> Error {
+        match failure.kind {
+            Kind::Failed => Error::new("Refused", failure.message, failure.hint),
+            _ => failure.into(),
+        }
+    }
+
+    fn mixed() -> Error {
+        let remedy = "make a subscription for each";
+        Error::new("Failure", "a subscription is used by either `for` or `async for`", remedy)
+    }
+}

@@ -1,0 +1,41 @@
+//! Errors as exceptions of the Python package.
+
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyModule, PyTuple};
+
+/// An error, with the name of its exception in `scanhub.errors`.
+#[derive(Debug)]
+pub(crate) struct Error {
+    pub(crate) class: &'static str,
+    message: String,
+    remedy: String,
+}
+
+impl Error {
+    pub(crate) fn new(class: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Error {
+        Error { class, message: message.into(), remedy: remedy.into() }
+    }
+}
+
+impl From<Error> for PyErr {
+    fn from(error: Error) -> PyErr {
+        let Error { class, message, remedy } = error;
+        Python::attach(|py| {
+            let raised = PyModule::import(py, "scanhub.errors")
+                .and_then(|errors| errors.getattr(class)?.call1((message, remedy)));
+            raised.map_or_else(|error| error, PyErr::from_value)
+        })
+    }
+}
+
+/// Creates a value of the class `name` of `scanhub.values`, a named tuple or a dataclass.
+pub(crate) fn value<'py>(
+    py: Python<'py>,
+    name: &str,
+    fields: impl IntoPyObject<'py, Target = PyTuple, Output = Bound<'py, PyTuple>, Error = PyErr>,
+) -> PyResult<Bound<'py, PyAny>> {
+    static VALUES: PyOnceLock<Py<PyModule>> = PyOnceLock::new();
+    let values = VALUES.get_or_try_init(py, || PyModule::import(py, "scanhub.values").map(Bound::unbind))?;
+    values.bind(py).getattr(name)?.call1(fields.into_pyobject(py)?)
+}

@@ -1,0 +1,182 @@
+//! The native part of the Python package `scanhub`: the module `scanhub._scanhub` on top of `scanhub_client`. The package adds
+//! the functions that programs call, the exceptions and the named tuples.
+
+mod client;
+mod error;
+mod sample;
+mod subscription;
+mod topics;
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use pyo3::prelude::*;
+use scanhub_client::{Request, Tilt, Topic, Verb};
+use scanhub_schema::{check_followed, is_remote};
+
+use client::{Confined, Mount, Name, Place};
+use error::Error;
+use sample::Sample;
+
+#[pymodule]
+fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("__commit__", env!("SCANHUB_COMMIT"))?;
+    module.add_class::<Sample>()?;
+    topics::add_to(module)?;
+    module.add_class::<subscription::Subscription>()?;
+    module.add_class::<subscription::RobotFollower>()?;
+    module.add_class::<Publication>()?;
+    module.add_function(wrap_pyfunction!(sample::restore, module)?)?;
+    module.add_function(wrap_pyfunction!(topic_names, module)?)?;
+    module.add_function(wrap_pyfunction!(request, module)?)
+}
+
+/// Returns the topic that `text` names, such as `front/scan`.
+fn parse(text: &str) -> Result<Name, Error> {
+    let parts = text.split_once('/').and_then(|(sensor, topic)| Some((sensor, Topic::parse(topic)?)));
+    let (sensor, topic) = parts.ok_or_else(|| {
+        let names: Vec<_> = Topic::ALL.iter().map(|topic| topic.name()).collect();
+        let remedy = format!("write SENSOR/TOPIC, as front/scan; topics are {}", names.join(", "));
+        Error::new("NoTopic", format!("no topic {text:?}"), remedy)
+    })?;
+    check_followed(sensor)?;
+    Ok(Name { sensor: sensor.into(), topic })
+}
+
+/// Returns the names of the running hub's sensors and topics.
+#[pyfunction]
+#[pyo3(name = "_topics")]
+fn topic_names(
+    py: Python<'_>,
+    domain: Option<String>,
+    root: Option<PathBuf>,
+) -> PyResult<Vec<(String, String)>> {
+    Ok(py.detach(|| client::topics(&Place { domain, root }))?)
+}
+
+/// Sends a request to the hub, and returns the background model of its answer.
+#[pyfunction]
+#[pyo3(name = "_request")]
+fn request(
+    py: Python<'_>,
+    sensor: &str,
+    order: &str,
+    domain: Option<String>,
+    root: Option<PathBuf>,
+) -> PyResult<Option<Py<PyAny>>> {
+    /// Interval at which signals are handled.
+    const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+    check_followed(sensor).map_err(Error::from)?;
+    let invalid = || Error::new("Impossible", format!("no order {order:?}"), "docs/python.md lists them");
+    let verb = Verb::parse(order).ok_or_else(invalid)?;
+    let (request, stop) = (Request::new(sensor, verb), Arc::new(AtomicBool::new(false)));
+    let place = Place { domain, root };
+    let (send, receive) = mpsc::channel();
+    // Only the main thread handles signals, and it must not wait for the hub then.
+    thread::spawn({
+        let stop = Arc::clone(&stop);
+        move || {
+            let answer = place.live().and_then(|domain| {
+                scanhub_client::request(&[domain], &request, &stop).map_err(Error::of_request)
+            });
+            let _ = send.send(answer);
+        }
+    });
+    let receive = Mutex::new(receive);
+    let answer = loop {
+        match py.detach(|| received_within(&receive, SIGNAL_INTERVAL)) {
+            Ok(answer) => break answer,
+            Err(RecvTimeoutError::Timeout) => {
+                py.check_signals().inspect_err(|_| stop.store(true, Ordering::Relaxed))?
+            }
+            Err(_) => {
+                break Err(Error::new("Failure", "the request ended without an answer", "please report it"));
+            }
+        }
+    };
+    let model = answer?.map(|shown| sample::Sample::of_model(sensor, &shown.model));
+    model.map(|model| topics::wrap(py, model)).transpose()
+}
+
+fn received_within<T>(receive: &Mutex<mpsc::Receiver<T>>, timeout: Duration) -> Result<T, RecvTimeoutError> {
+    receive.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout)
+}
+
+/// Published angles of a mount.
+#[pyclass(frozen, module = "scanhub")]
+struct Publication(Confined<Mount>);
+
+#[pymethods]
+impl Publication {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        topic: &str,
+        domain: Option<String>,
+        root: Option<PathBuf>,
+    ) -> PyResult<Publication> {
+        let Name { sensor, topic } = parse(topic)?;
+        if topic != Topic::Tilt {
+            let what = format!("Python does not publish {}", topic.name());
+            return Err(
+                Error::new("Impossible", what, "tilt, as in mount/tilt; Rust publishes all topics").into()
+            );
+        }
+        if is_remote(&sensor) {
+            let what = format!("{sensor} is not the name of a mount");
+            return Err(Error::new("Impossible", what, "one without a dot, for example mount").into());
+        }
+        // A publication is created and used by one thread at a time.
+        let mount = py.detach(|| Mount::new(&sensor, &Place { domain, root }).map(Confined::new))?;
+        Ok(Publication(mount))
+    }
+
+    /// Publishes that the mount was at `angle_rad` at `stamp_ns` of `time.monotonic_ns()`, by default now.
+    #[pyo3(signature = (angle_rad, *, rate_rad_s = None, stamp_ns = None))]
+    fn send(
+        &self,
+        angle_rad: f64,
+        rate_rad_s: Option<f64>,
+        stamp_ns: Option<Bound<'_, PyAny>>,
+    ) -> PyResult<()> {
+        let in_range = |stamp: Bound<'_, PyAny>| match stamp.extract::<u64>() {
+            Err(error) if error.is_instance_of::<pyo3::exceptions::PyOverflowError>(stamp.py()) => {
+                let what = format!("stamp_ns {stamp} is no time");
+                Err(Error::new("Impossible", what, "a time of time.monotonic_ns(), or None for now").into())
+            }
+            stamp_ns => stamp_ns,
+        };
+        let stamp_ns = stamp_ns.map(in_range).transpose()?;
+        let tilt = Tilt { angle_rad, rate_rad_s: rate_rad_s.unwrap_or(f64::NAN) };
+        let ended = || {
+            let remedy = "publish again; a child publishes under a name of its own";
+            Error::new("Failure", "this publication has ended", remedy)
+        };
+        Ok(self.0.with(|mount| mount.send(stamp_ns, tilt)).ok_or_else(ended)??)
+    }
+
+    /// Number of subscribers.
+    #[getter]
+    fn subscribers(&self) -> usize {
+        self.0.with(|mount| mount.subscribers()).unwrap_or_default()
+    }
+
+    /// Ends the publication and releases the name.
+    fn close(&self) {
+        drop(self.0.take());
+    }
+
+    fn __enter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_error))]
+    fn __exit__(&self, _error: &Bound<'_, pyo3::types::PyTuple>) {
+        self.close();
+    }
+}

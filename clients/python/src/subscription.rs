@@ -1,0 +1,241 @@
+//! Subscriptions to topics and to the verdict of a robot. While a subscription waits, other threads of Python run.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use pyo3::prelude::*;
+use pyo3::types::{PyAny, PyDict};
+
+use crate::client::{Confined, Follow, Place, Received, Topics, Verdict, Verdicts};
+use crate::error::{Error, value};
+use crate::sample::Sample;
+use crate::{parse, topics};
+
+/// Returns the next item, after a wait if none has arrived. `None` if the subscription is closed.
+fn next<F: Follow<Item: Send> + 'static>(
+    py: Python<'_>,
+    this: &Arc<Confined<F>>,
+    timeout: Option<f64>,
+    notice: Option<&Py<PyAny>>,
+) -> PyResult<Option<F::Item>> {
+    let _reserved = this.reserve()?;
+    let until = timeout.and_then(|seconds| {
+        // A timeout that is too long for the clock is none.
+        Instant::now().checked_add(Duration::try_from_secs_f64(seconds.max(0.0)).ok()?)
+    });
+    let mut item = poll(py, this, notice)?;
+    loop {
+        if item.is_some() || !is_open(this) {
+            return Ok(item);
+        }
+        let left = until.map_or(Duration::MAX, |until| until.saturating_duration_since(Instant::now()));
+        if left.is_zero() {
+            return Err(silence(this, timeout).into());
+        }
+        let waited = py.detach(|| {
+            this.with(|follower| follower.wait(left)).transpose()?;
+            F::try_next(this)
+        });
+        item = waited?;
+        notify(py, this, notice)?;
+        if item.is_none() {
+            py.check_signals()?;
+        }
+    }
+}
+
+/// Returns the next item that has arrived.
+fn poll<F: Follow>(
+    py: Python<'_>,
+    this: &Arc<Confined<F>>,
+    notice: Option<&Py<PyAny>>,
+) -> PyResult<Option<F::Item>> {
+    if !is_open(this) {
+        return Ok(None);
+    }
+    let item = F::try_next(this)?;
+    notify(py, this, notice)?;
+    Ok(item)
+}
+
+fn notify<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>, notice: Option<&Py<PyAny>>) -> PyResult<()> {
+    let Some(call) = notice else { return Ok(()) };
+    let notices = this.with(Follow::notices).unwrap_or_default();
+    notices.into_iter().try_for_each(|notice| call.call1(py, (notice,)).map(drop))
+}
+
+fn is_open<F: Follow>(this: &Arc<Confined<F>>) -> bool {
+    this.with(|follower| !follower.has_left()).unwrap_or_default()
+}
+
+fn silence<F: Follow>(this: &Arc<Confined<F>>, timeout: Option<f64>) -> Error {
+    let silence = this.with(|follower| follower.silence(timeout.unwrap_or_default()));
+    silence.unwrap_or_else(closed)
+}
+
+fn descriptor<F: Follow>(this: &Arc<Confined<F>>) -> Result<i32, Error> {
+    let _reserved = this.reserve()?;
+    this.with(Follow::descriptor).unwrap_or_else(|| Err(closed()))
+}
+
+fn closed() -> Error {
+    Error::new("Failure", "the subscription is closed", "subscribe again")
+}
+
+/// Subscription to topics. Iterate over it, with `for` or with `async for`.
+#[pyclass(subclass, frozen, module = "scanhub._scanhub")]
+pub(crate) struct Subscription {
+    topics: Arc<Confined<Topics>>,
+    timeout: Option<f64>,
+    notice: Option<Py<PyAny>>,
+}
+
+#[pymethods]
+impl Subscription {
+    #[new]
+    fn new(
+        names: Vec<String>,
+        domain: Option<String>,
+        root: Option<PathBuf>,
+        timeout: Option<f64>,
+        on_notice: Option<Py<PyAny>>,
+    ) -> PyResult<Subscription> {
+        let mut unique = Vec::new();
+        for name in &names {
+            let name = parse(name)?;
+            if !unique.contains(&name) {
+                unique.push(name);
+            }
+        }
+        if unique.is_empty() {
+            return Err(
+                Error::new("NoTopic", "no topic is named", "write SENSOR/TOPIC, as front/scan").into()
+            );
+        }
+        let topics = Arc::new(Confined::new(Topics::new(unique, &Place { domain, root })?));
+        Ok(Subscription { topics, timeout, notice: on_notice })
+    }
+
+    fn __iter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+        wrapped(py, next(py, &self.topics, self.timeout, self.notice.as_ref())?)
+    }
+
+    /// Leaves the domain. Samples that the program keeps stay readable.
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| self.topics.with(Topics::leave));
+    }
+
+    /// Whether a hub or listener publishes in the domain, as of the last look.
+    #[getter]
+    fn hub_lives(&self) -> bool {
+        self.topics.with(|topics| topics.hub_lives()).unwrap_or_default()
+    }
+
+    #[getter]
+    fn _timeout(&self) -> Option<f64> {
+        self.timeout
+    }
+
+    #[getter]
+    fn _is_open(&self) -> bool {
+        is_open(&self.topics)
+    }
+
+    fn _poll(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+        let _reserved = self.topics.reserve()?;
+        wrapped(py, poll(py, &self.topics, self.notice.as_ref())?)
+    }
+
+    fn _descriptor(&self) -> Result<i32, Error> {
+        descriptor(&self.topics)
+    }
+
+    fn _silence(&self) -> PyErr {
+        silence(&self.topics, self.timeout).into()
+    }
+}
+
+fn wrapped(py: Python<'_>, received: Option<Received>) -> PyResult<Option<Py<PyAny>>> {
+    received.map(|received| topics::wrap(py, Sample::from(received))).transpose()
+}
+
+/// Subscription to the verdict of a robot. Iterate over it, with `for` or with `async for`.
+#[pyclass(subclass, frozen, module = "scanhub._scanhub")]
+pub(crate) struct RobotFollower {
+    verdicts: Arc<Confined<Verdicts>>,
+}
+
+#[pymethods]
+impl RobotFollower {
+    #[new]
+    fn new(
+        sensors: Vec<String>,
+        domain: Option<String>,
+        root: Option<PathBuf>,
+        early: bool,
+    ) -> PyResult<RobotFollower> {
+        let sensors: Vec<&str> = sensors.iter().map(String::as_str).collect();
+        let verdicts = Verdicts::new(&sensors, &Place { domain, root }, early)?;
+        Ok(RobotFollower { verdicts: Arc::new(Confined::new(verdicts)) })
+    }
+
+    fn __iter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        next(py, &self.verdicts, None, None)?.map(|verdict| robot(py, verdict)).transpose()
+    }
+
+    /// Returns what is known now. Never waits.
+    fn now<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let _reserved = self.verdicts.reserve()?;
+        robot(py, self.verdicts.with(Verdicts::now).transpose()?.unwrap_or_default())
+    }
+
+    /// Leaves the domain.
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| drop(self.verdicts.take()));
+    }
+
+    /// Whether a hub or listener publishes in the domain, as of the last look.
+    #[getter]
+    fn hub_lives(&self) -> bool {
+        self.verdicts.with(|verdicts| verdicts.hub_lives()).unwrap_or_default()
+    }
+
+    #[getter]
+    fn _timeout(&self) -> Option<f64> {
+        None
+    }
+
+    #[getter]
+    fn _is_open(&self) -> bool {
+        is_open(&self.verdicts)
+    }
+
+    fn _poll<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let _reserved = self.verdicts.reserve()?;
+        poll(py, &self.verdicts, None)?.map(|verdict| robot(py, verdict)).transpose()
+    }
+
+    fn _descriptor(&self) -> Result<i32, Error> {
+        descriptor(&self.verdicts)
+    }
+
+    fn _silence(&self) -> PyErr {
+        silence(&self.verdicts, None).into()
+    }
+}
+
+fn robot(py: Python<'_>, verdict: Verdict) -> PyResult<Bound<'_, PyAny>> {
+    let sensors = PyDict::new(py);
+    verdict.sensors.iter().try_for_each(|(sensor, verdict)| sensors.set_item(sensor, verdict))?;
+    let (nearest_mm, nearest_sensor) = verdict.nearest.unzip();
+    value(py, "Robot", (verdict.verdict, verdict.worst, nearest_mm, nearest_sensor, sensors))
+}
