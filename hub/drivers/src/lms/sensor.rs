@@ -122,6 +122,8 @@ pub struct Sensor {
     software: [u8; SOFTWARE_LEN],
     kind: [u8; KIND_LEN],
     kind_len: usize,
+    /// Family that the type names.
+    family: Option<Family>,
     /// Number of telegrams in a row whose condition was better.
     calm: u16,
     /// Whether the line damages telegrams, so that a single one does not prove a worse condition.
@@ -147,7 +149,7 @@ impl Sensor {
 
     /// Returns whether its scans have none of the angles of [`Variant`], although they look so.
     pub fn has_other_angles(&self) -> bool {
-        Family::of_type(self.kind()) == Some(Family::Fast)
+        self.family == Some(Family::Fast)
     }
 
     /// Returns the measuring mode if values are ranges at known angles. `None`: there are no scans.
@@ -180,7 +182,7 @@ impl Sensor {
     /// same one with another configuration. State that each scan repeats may stay.
     pub(crate) fn forget(&mut self) {
         self.mode = None;
-        self.kind_len = 0;
+        self.set_kind(&[]);
         self.defective = None;
         self.complaint = None;
         self.is_confirmed = false;
@@ -214,8 +216,16 @@ impl Sensor {
     /// Restores an identity of a scanner that still streams as it did then.
     pub(crate) fn restore_identity(&mut self, known: Identity) {
         self.mode = Some(known.mode);
-        self.kind = known.kind;
-        self.kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(KIND_LEN);
+        let kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(KIND_LEN);
+        self.set_kind(&known.kind[..kind_len]);
+    }
+
+    /// Stores the type `kind`, of which the first [`KIND_LEN`] bytes count.
+    fn set_kind(&mut self, kind: &[u8]) {
+        self.kind_len = kind.len().min(KIND_LEN);
+        self.kind = [0; KIND_LEN];
+        self.kind[..self.kind_len].copy_from_slice(&kind[..self.kind_len]);
+        self.family = Family::of_type(self.kind());
     }
 
     /// Stores what `telegram` reports, which decodes to `reply`.
@@ -241,11 +251,7 @@ impl Sensor {
                 self.unit = Some(measured.unit());
                 self.variant = Variant::of_beams(measured.count()).or(self.variant);
             }
-            Reply::Type(name) => {
-                self.kind = [0; KIND_LEN];
-                self.kind_len = name.len().min(KIND_LEN);
-                self.kind[..self.kind_len].copy_from_slice(&name[..self.kind_len]);
-            }
+            Reply::Type(name) => self.set_kind(name),
             _ => {}
         }
     }
