@@ -8,7 +8,7 @@ use std::rc::Rc;
 use bytemuck::pod_read_unaligned;
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Freshness, Noted, Numbers};
-use scanhub_schema::{MICROS, MILLIS, Nanos, Topic, Verdict, Zones};
+use scanhub_schema::{MICROS, MILLIS, Nanos, Ring, Topic, Verdict, Zones};
 
 use crate::event::Event;
 use crate::shared::Shared;
@@ -25,8 +25,19 @@ pub(crate) enum Habit {
     Prompt,
     /// Takes one sample each so many milliseconds.
     Slow { every_ms: u64 },
+    /// As a prompt one, but it sleeps on the event of the sensor.
+    Listener,
     /// As a prompt one, and believes what it hears.
     Robot,
+}
+
+/// Something on which subscribers of a sensor sleep.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Bell {
+    /// A word of the doorbell.
+    Ring(Ring),
+    /// The event.
+    Event,
 }
 
 /// One consumer of one topic of one sensor.
@@ -47,20 +58,20 @@ pub(crate) struct Consumer {
 }
 
 impl Consumer {
-    /// Attaches at `now`; nothing if there is no place.
+    /// Attaches at `now`. Returns `None` if there is no place.
     pub(crate) fn attach(
         shared: &Shared,
         number: Number,
         (sensor, topic): (usize, Topic),
         habit: Habit,
         holds: usize,
+        now: Nanos,
     ) -> Option<Consumer> {
-        let now = shared.clock.get();
-        if !shared.board.borrow_mut().attach(sensor, topic, number) {
+        let (is_prompt, is_listener) = (habit == Habit::Prompt, habit == Habit::Listener);
+        if !shared.board.borrow_mut().attach(sensor, topic, number, is_listener) {
             return None;
         }
-        let is_prompt = habit == Habit::Prompt;
-        shared.tell(&Event::Attached { consumer: number, sensor, topic, is_prompt });
+        shared.log.tell(now, &Event::Attached { consumer: number, sensor, topic, is_prompt, is_listener });
         let belief = (habit == Habit::Robot).then(|| (Freshness::new(moment(now)), Verdict::Unknown));
         let next_at = now + GREETING;
         let (held, numbers) = (VecDeque::new(), Numbers::default());
@@ -78,8 +89,19 @@ impl Consumer {
         })
     }
 
-    /// The hub woke the consumers of its sensor at `at`.
-    pub(crate) fn wake(&mut self, at: Nanos) {
+    /// The hub rang `bell` of its sensor at `at`.
+    pub(crate) fn wake(&mut self, bell: Bell, at: Nanos) {
+        let awaited = match self.habit {
+            Habit::Listener => Bell::Event,
+            _ => Bell::Ring(self.topic.row().ring),
+        };
+        if bell == awaited {
+            self.look_at(at);
+        }
+    }
+
+    /// It looks for samples at `at`, unless it does so at times of its own.
+    pub(crate) fn look_at(&mut self, at: Nanos) {
         if !matches!(self.habit, Habit::Slow { .. }) {
             self.next_at = self.next_at.min(at + TAKES);
         }
@@ -112,7 +134,7 @@ impl Consumer {
                 self.next_at = now + every_ms * MILLIS;
                 self.take(shared, now);
             }
-            Habit::Prompt | Habit::Robot => {
+            Habit::Prompt | Habit::Listener | Habit::Robot => {
                 self.next_at = Nanos::MAX;
                 while self.take(shared, now) {}
             }

@@ -44,10 +44,12 @@ pub(crate) enum Event<'a> {
     Published { sensor: usize, sample: &'a Sample },
     /// Whoever sleeps at the bell of a sensor for topics of this ring is woken.
     Rung { sensor: usize, ring: Ring },
+    /// The hub sent the event of a sensor, which wakes its listeners.
+    Notified { sensor: usize },
     /// A sample got no memory.
     Lacking { sensor: usize, topic: Topic },
     /// A consumer came.
-    Attached { consumer: Number, sensor: usize, topic: Topic, is_prompt: bool },
+    Attached { consumer: Number, sensor: usize, topic: Topic, is_prompt: bool, is_listener: bool },
     /// It took a sample, of which it was told by its number that it missed so many before.
     Taken { consumer: Number, sample: &'a Sample, missed: u64 },
     /// A sample fell out of its full queue.
@@ -225,6 +227,7 @@ impl Event<'_> {
             // What it tells of them is hashed.
             Event::Measured { .. } | Event::Written { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
+            Event::Notified { sensor } => numbers(&[32, sensor as u64]),
             Event::Lacking { sensor, topic } => numbers(&[11, sensor as u64, topic as u64]),
             Event::Attached { consumer, sensor, topic, .. } => {
                 numbers(&[12, consumer.0.into(), sensor as u64, topic as u64]);
@@ -308,7 +311,8 @@ impl Event<'_> {
                 }
             }
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
-            Event::Rung { .. } | Event::Measured { .. } | Event::Written { .. } => None,
+            Event::Rung { .. } | Event::Notified { .. } => None,
+            Event::Measured { .. } | Event::Written { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
             Event::Accounted { .. } => None,
             Event::Forged { forgery, .. } => Some(format!("forged: {forgery:?}")),

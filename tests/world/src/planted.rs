@@ -89,11 +89,17 @@ pub enum Defect {
     WrongFamily,
     /// Now and then the hub sends a needless byte to a scanner that streams.
     NeedlessByte,
+    /// The hub is not told that a subscriber has attached.
+    UnseenSubscriber,
+    /// Now and then the hub rings for nobody.
+    NeedlessRing,
+    /// Now and then the event is not sent.
+    UnsentEvent,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 40] = [
+    pub const ALL: [Defect; 43] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -134,6 +140,9 @@ impl Defect {
         Defect::UnsentWarning,
         Defect::WrongFamily,
         Defect::NeedlessByte,
+        Defect::UnseenSubscriber,
+        Defect::NeedlessRing,
+        Defect::UnsentEvent,
     ];
 }
 

@@ -51,6 +51,8 @@ pub(crate) struct Terms {
     pub(crate) has_key: bool,
     /// Gateway and listener are bridges, and a router is between them.
     pub(crate) are_bridges: bool,
+    /// Topics that the gateway does not send.
+    lonely: [bool; Topic::ALL.len()],
     /// With a key: so much the wall clock of the listener's machine is ahead of the hub's, in ns.
     ahead_ns: i64,
 }
@@ -60,6 +62,10 @@ impl Terms {
         let seed = plan.seed;
         let mut random = fastrand::Rng::with_seed(seed ^ 0x001A_0000_1A00);
         let every = NonZeroU64::MIN.saturating_add([0, 0, 1, 3, 7][random.usize(..5)]);
+        let mut lonely = [false; Topic::ALL.len()];
+        actions::lonely_topics(&plan.actions, seed)
+            .into_iter()
+            .for_each(|topic| lonely[topic as usize] = true);
         Terms {
             every,
             sends_telegrams: random.bool(),
@@ -69,6 +75,7 @@ impl Terms {
             clocks: Stamp { monotonic_ns: random.u64(1..1 << 50), wall_ns: random.u64(1 << 60..1 << 61) },
             has_key: actions::have_key(&plan.actions),
             are_bridges: actions::are_bridges(&plan.actions),
+            lonely,
             ahead_ns: random.i64(-2_000_000_000..2_000_000_000),
         }
     }
@@ -77,6 +84,7 @@ impl Terms {
     pub(crate) fn every(&self, topic: Topic) -> Option<NonZeroU64> {
         match topic {
             Topic::Telegram if !self.sends_telegrams => None,
+            _ if self.lonely[topic as usize] => None,
             Topic::Background | Topic::Status => Some(NonZeroU64::MIN),
             _ => Some(self.every),
         }

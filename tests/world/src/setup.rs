@@ -7,6 +7,7 @@ use scanhub_config::{Config, Sources};
 use scanhub_schema::{Failure, Topic};
 use scanhub_sim::room::Changes;
 
+use crate::actions::lonely_topics;
 use crate::consumer::Habit;
 use crate::family::{self, Family};
 use crate::plan::Plan;
@@ -34,8 +35,10 @@ impl Setup {
             None => family::draw(&mut random),
         };
         let mut cast = Vec::new();
+        let lonely = lonely_topics(&plan.actions, plan.seed);
         for sensor in 0..sensors.len() {
-            cast.extend(Topic::OF_LINKS.map(|topic| (sensor, topic, Habit::Prompt, 0)));
+            let topics = Topic::OF_LINKS.into_iter().filter(|topic| !lonely.contains(topic));
+            cast.extend(topics.map(|topic| (sensor, topic, Habit::Prompt, 0)));
             cast.push((sensor, Topic::Zones, Habit::Robot, 0));
             let every_ms = random.u64(5..400);
             cast.push((sensor, Topic::Scan, Habit::Slow { every_ms }, random.usize(0..=4)));

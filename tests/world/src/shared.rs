@@ -5,8 +5,9 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use scanhub_schema::{Nanos, Ring};
+use scanhub_schema::{Nanos, Topic};
 
+use crate::consumer::{Bell, Consumer, Habit, Number};
 use crate::event::{Detail, Event, Figures, Violation};
 use crate::hash::History;
 use crate::judges::{Judge, Say};
@@ -37,13 +38,74 @@ pub(crate) struct Shared {
     pub(crate) handles: Cell<usize>,
     /// Nobody can open anything.
     pub(crate) lacks_descriptors: Cell<bool>,
-    /// Sensors whose consumers were woken, of which topics, and when.
-    pub(crate) woken: RefCell<Vec<(usize, Ring, Nanos)>>,
+    /// Sensors whose consumers were woken, by what, and when.
+    pub(crate) woken: RefCell<Vec<(usize, Bell, Nanos)>>,
+    /// Number of the next consumer.
+    pub(crate) next_consumer: Cell<u32>,
+    /// Changes of subscribers that happen while a hub sends the samples of a scan.
+    pub(crate) changes: RefCell<Vec<Change>>,
+    /// Consumers that have come by such a change, with the milliseconds for which they stay, and those that have left.
+    pub(crate) newcomers: RefCell<Vec<(Consumer, u64)>>,
+    pub(crate) leavers: RefCell<Vec<Number>>,
+}
+
+/// A change of the subscribers of a sensor after it has sent some more samples.
+pub(crate) struct Change {
+    pub(crate) sensor: usize,
+    /// Number of samples that are sent before it happens.
+    pub(crate) sends: u64,
+    pub(crate) what: Who,
+}
+
+/// Consumer that comes or leaves.
+#[derive(Clone, Copy)]
+pub(crate) enum Who {
+    /// A new one comes, and stays for this number of milliseconds.
+    Comes { topic: Topic, habit: Habit, holds: usize, span_ms: u64 },
+    /// This subscriber of a topic leaves.
+    Leaves { topic: Topic, number: Number },
 }
 
 impl Shared {
     pub(crate) fn tell(&self, event: &Event<'_>) {
         self.log.tell(self.clock.get(), event);
+    }
+
+    /// Returns the number of a new consumer.
+    pub(crate) fn consumer_number(&self) -> Number {
+        let number = self.next_consumer.get();
+        self.next_consumer.set(number + 1);
+        Number(number)
+    }
+
+    /// A sample of `sensor` was sent at `now`: lets those changes of subscribers happen that are due.
+    pub(crate) fn change_subscribers(&self, sensor: usize, now: Nanos) {
+        let mut due = Vec::new();
+        self.changes.borrow_mut().retain_mut(|change| {
+            if change.sensor != sensor {
+                return true;
+            }
+            if change.sends == 0 {
+                due.push(change.what);
+                return false;
+            }
+            change.sends -= 1;
+            true
+        });
+        for who in due {
+            match who {
+                Who::Comes { topic, habit, holds, span_ms } => {
+                    let number = self.consumer_number();
+                    let came = Consumer::attach(self, number, (sensor, topic), habit, holds, now);
+                    self.newcomers.borrow_mut().extend(came.map(|consumer| (consumer, span_ms)));
+                }
+                Who::Leaves { topic, number } => {
+                    self.board.borrow_mut().detach(sensor, topic, number, false);
+                    self.log.tell(now, &Event::Left { consumer: number, is_drained: false });
+                    self.leavers.borrow_mut().push(number);
+                }
+            }
+        }
     }
 }
 

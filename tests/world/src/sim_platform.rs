@@ -12,6 +12,7 @@ use scanhub_port::{PortError, Source};
 use scanhub_schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
 use scanhub_shm::Payload;
 
+use crate::consumer::Bell;
 use crate::event::Event;
 use crate::line::{Handle, LinkClock, OpenLine};
 use crate::planted::Defect;
@@ -47,7 +48,10 @@ impl<'a> SimPlatform<'a> {
         let (now, Shared { planted, woken, log, .. }) = (self.clock.now(), &*self.shared);
         if !planted.strikes(Defect::LostWake, 200) {
             log.tell(now, &Event::Rung { sensor: self.number, ring });
-            woken.borrow_mut().push((self.number, ring, now));
+            woken.borrow_mut().push((self.number, Bell::Ring(ring), now));
+            if planted.strikes(Defect::NeedlessRing, 100) {
+                log.tell(now, &Event::Rung { sensor: self.number, ring });
+            }
         }
     }
 
@@ -138,11 +142,12 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn attached(&self) -> Option<u32> {
-        Some(self.shared.board.borrow().changes)
+        let Shared { board, planted, .. } = &*self.shared;
+        Some(if planted.is(Defect::UnseenSubscriber) { 0 } else { board.borrow().attached(self.number) })
     }
 
     fn has_listeners(&self) -> bool {
-        true
+        self.shared.board.borrow().has_listeners(self.number)
     }
 
     fn ring(&self, ring: Ring) {
@@ -154,7 +159,11 @@ impl Platform for SimPlatform<'_> {
     }
 
     fn notify_event(&self, _: Wake) {
-        // Nobody here listens to the event.
+        let (now, Shared { planted, woken, log, .. }) = (self.clock.now(), &*self.shared);
+        if !planted.strikes(Defect::UnsentEvent, 20) {
+            log.tell(now, &Event::Notified { sensor: self.number });
+            woken.borrow_mut().push((self.number, Bell::Event, now));
+        }
         if self.is_owed.take() {
             self.rouse(Ring::First);
         }

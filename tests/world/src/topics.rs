@@ -28,6 +28,8 @@ pub(crate) struct Sample {
     /// When it was sent, and how many of its topic were sent before it by the same hub.
     pub(crate) at: Nanos,
     pub(crate) index: u64,
+    /// Number of subscribers to which it was sent.
+    pub(crate) reached: usize,
     /// Samples that are in memory count as long as anybody has them.
     _counted: Counted,
 }
@@ -55,8 +57,8 @@ pub(crate) struct Board {
     /// Loans that were not sent, and samples that are held, wait or are kept.
     loans: Rc<Cell<usize>>,
     samples: Rc<Cell<usize>>,
-    /// Number of times that subscribers of any sensor have attached or left.
-    pub(crate) changes: u32,
+    /// For each sensor, the number of times that a subscriber has attached.
+    attached: Vec<u32>,
     /// No publisher gets memory.
     pub(crate) lacks_memory: bool,
 }
@@ -71,6 +73,8 @@ struct Place {
     consumer: Number,
     queue: VecDeque<Rc<Sample>>,
     is_connected: bool,
+    /// It sleeps on the event of the sensor.
+    is_listener: bool,
     /// Its process was killed; the next hub cleans up.
     is_dead: bool,
 }
@@ -81,7 +85,7 @@ impl Board {
             sensors: (0..sensors).map(|_| Default::default()).collect(),
             loans: Rc::default(),
             samples: Rc::default(),
-            changes: 0,
+            attached: vec![0; sensors],
             lacks_memory: false,
         }
     }
@@ -101,7 +105,6 @@ impl Board {
 
     /// What killed consumers left is removed.
     pub(crate) fn clean(&mut self) {
-        self.changes += 1;
         let channels = self.sensors.iter_mut().flatten();
         channels.for_each(|channel| channel.places.retain(|place| !place.is_dead));
     }
@@ -111,20 +114,36 @@ impl Board {
         self.sensors.iter_mut().flatten().for_each(|channel| channel.kept.clear());
     }
 
-    /// A place for `consumer`, if there is one.
-    pub(crate) fn attach(&mut self, sensor: usize, topic: Topic, consumer: Number) -> bool {
-        self.changes += 1;
+    /// Returns the number of times that a subscriber of `sensor` has attached.
+    pub(crate) fn attached(&self, sensor: usize) -> u32 {
+        self.attached[sensor]
+    }
+
+    /// Returns whether the event of `sensor` has a listener. A killed one counts until the next hub cleans up.
+    pub(crate) fn has_listeners(&self, sensor: usize) -> bool {
+        self.sensors[sensor].iter().flat_map(|channel| &channel.places).any(|place| place.is_listener)
+    }
+
+    /// A place for `consumer`, if there is one. An `is_listener` sleeps on the event of the sensor.
+    pub(crate) fn attach(
+        &mut self,
+        sensor: usize,
+        topic: Topic,
+        consumer: Number,
+        is_listener: bool,
+    ) -> bool {
+        self.attached[sensor] += 1;
         let places = &mut self.sensors[sensor][topic as usize].places;
         let has_room = places.len() < TopicLimits::default().consumers;
         if has_room {
-            places.push(Place { consumer, queue: VecDeque::new(), is_connected: false, is_dead: false });
+            let queue = VecDeque::new();
+            places.push(Place { consumer, queue, is_connected: false, is_listener, is_dead: false });
         }
         has_room
     }
 
     /// `consumer` leaves, or is killed.
     pub(crate) fn detach(&mut self, sensor: usize, topic: Topic, consumer: Number, is_killed: bool) {
-        self.changes += 1;
         let places = &mut self.sensors[sensor][topic as usize].places;
         if is_killed {
             places.iter_mut().for_each(|place| place.is_dead |= place.consumer == consumer);
@@ -137,6 +156,11 @@ impl Board {
     pub(crate) fn take(&mut self, sensor: usize, topic: Topic, consumer: Number) -> Option<Rc<Sample>> {
         let places = &mut self.sensors[sensor][topic as usize].places;
         places.iter_mut().find(|place| place.consumer == consumer)?.queue.pop_front()
+    }
+
+    /// Returns the number of subscribers of a topic.
+    fn subscribers(&self, sensor: usize, topic: Topic) -> usize {
+        self.sensors[sensor][topic as usize].places.len()
     }
 
     fn connect(&mut self, sensor: usize, topic: Topic, log: &Log, now: Nanos) {
@@ -213,7 +237,7 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
     type Loan = Loan<P>;
 
     fn subscribers(&self) -> usize {
-        self.shared.board.borrow().sensors[self.sensor][P::TOPIC as usize].places.len()
+        self.shared.board.borrow().subscribers(self.sensor, P::TOPIC)
     }
 
     fn connect(&self) -> Result<(), impl Debug + use<P>> {
@@ -241,6 +265,14 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
     }
 
     fn send(&self, loan: Loan<P>, header: &Header) -> Result<usize, SendError> {
+        let reached = self.send_now(loan, header);
+        self.shared.change_subscribers(self.sensor, self.clock.now());
+        reached
+    }
+}
+
+impl<P: Payload + ?Sized> Carrier<P> {
+    fn send_now(&self, loan: Loan<P>, header: &Header) -> Result<usize, SendError> {
         let now = self.clock.now();
         let Shared { board, log, planted, .. } = &*self.shared;
         let mut board = board.borrow_mut();
@@ -268,7 +300,8 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
             self.spoiler.borrow_mut().spoil(planted, (topic, now), &mut header, &mut bytes);
         }
         let index = self.sent.replace(self.sent.get() + 1);
-        let sample = Rc::new(Sample { topic, header, bytes, at: now, index, _counted });
+        let reached = board.subscribers(self.sensor, topic);
+        let sample = Rc::new(Sample { topic, header, bytes, at: now, index, reached, _counted });
         log.tell(now, &Event::Published { sensor: self.sensor, sample: &sample });
         if planted.strikes(Defect::LeakedLoan, 1_000) {
             std::mem::forget(loan);

@@ -10,7 +10,7 @@ use scanhub_schema::{MILLIS, Nanos, Topic, Verb};
 use scanhub_sim::fault::Faults;
 
 use crate::actions::scene_changes;
-use crate::consumer::{Consumer, Habit, Number};
+use crate::consumer::{Bell, Consumer, Habit, Number};
 use crate::event::{Detail, Event, Figures, Violation};
 use crate::family::Ailment;
 use crate::hub;
@@ -19,7 +19,7 @@ use crate::plan::{Action, Plan};
 use crate::planted::{Defect, Planted};
 use crate::remote::Remote;
 use crate::setup::Setup;
-use crate::shared::{Log, Shared};
+use crate::shared::{Change, Log, Shared, Who};
 use crate::topics::Board;
 use crate::tty::Tty;
 
@@ -77,7 +77,6 @@ pub(crate) struct World {
     pub(crate) setup: Rc<Setup>,
     pub(crate) seed: u64,
     pub(crate) consumers: Vec<Consumer>,
-    next_consumer: u32,
     actions: VecDeque<Action>,
     later: BTreeMap<(Nanos, u64), Later>,
     next_later: u64,
@@ -117,13 +116,16 @@ impl World {
             handles: Cell::new(0),
             lacks_descriptors: Cell::new(false),
             woken: RefCell::default(),
+            next_consumer: Cell::default(),
+            changes: RefCell::default(),
+            newcomers: RefCell::default(),
+            leavers: RefCell::default(),
         });
         let mut world = World {
             shared,
             setup: setup.clone(),
             seed: plan.seed,
             consumers: Vec::new(),
-            next_consumer: 0,
             actions: plan.actions.clone().into(),
             later: BTreeMap::new(),
             next_later: 0,
@@ -203,17 +205,36 @@ impl World {
 
     /// Lets consumers know that they were woken.
     pub(crate) fn ring(&mut self) {
-        for (sensor, ring, at) in self.shared.woken.borrow_mut().drain(..) {
+        self.admit_newcomers();
+        for (sensor, bell, at) in self.shared.woken.borrow_mut().drain(..) {
             let its = self.consumers.iter_mut().filter(|consumer| consumer.sensor == sensor);
-            its.filter(|consumer| consumer.topic.row().ring == ring).for_each(|consumer| consumer.wake(at));
-            self.remote.wake(at);
+            its.for_each(|consumer| consumer.wake(bell, at));
+            if bell != Bell::Event {
+                self.remote.wake(at);
+            }
+        }
+    }
+
+    /// Takes over the consumers that came and left while samples were sent.
+    fn admit_newcomers(&mut self) {
+        let shared = self.shared.clone();
+        let leavers = shared.leavers.take();
+        self.consumers.retain(|consumer| !leavers.contains(&consumer.number));
+        for (consumer, span_ms) in shared.newcomers.take() {
+            let (sensor, topic, number) = (consumer.sensor, consumer.topic, consumer.number);
+            self.consumers.push(consumer);
+            self.later(span_ms, move |world| {
+                let what = Who::Leaves { topic, number };
+                let sends = u64::from(number.0) % MOST_SENDS;
+                world.shared.changes.borrow_mut().push(Change { sensor, sends, what });
+            });
         }
     }
 
     /// Consumers look for a hub now and then, and find the one that begins.
     pub(crate) fn greet(&mut self) {
         let at = self.now() + LOOKS;
-        self.consumers.iter_mut().for_each(|consumer| consumer.wake(at));
+        self.consumers.iter_mut().for_each(|consumer| consumer.look_at(at));
         self.remote.wake(at);
     }
 
@@ -232,9 +253,8 @@ impl World {
         habit: Habit,
         holds: usize,
     ) -> Option<Number> {
-        let number = Number(self.next_consumer);
-        self.next_consumer += 1;
-        let consumer = Consumer::attach(&self.shared, number, (sensor, topic), habit, holds)?;
+        let number = self.shared.consumer_number();
+        let consumer = Consumer::attach(&self.shared, number, (sensor, topic), habit, holds, self.now())?;
         self.consumers.push(consumer);
         Some(number)
     }
@@ -305,6 +325,7 @@ impl World {
     }
 
     fn close(mut self) -> Outcome {
+        self.admit_newcomers();
         for consumer in &mut self.consumers {
             consumer.drain(&self.shared);
         }
@@ -328,5 +349,7 @@ impl World {
 
 /// The wall clock when a world begins: some day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
+/// More than the samples of one scan: a consumer leaves after fewer.
+const MOST_SENDS: u64 = 12;
 /// A consumer without a hub looks for one so often.
 const LOOKS: Nanos = 50 * MILLIS;

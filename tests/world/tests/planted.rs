@@ -38,6 +38,7 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::UnmarkedEstimate | Defect::NeedlessEstimate => &["stamps"],
         Defect::UnsentWarning => &["early"],
         Defect::WrongFamily | Defect::NeedlessByte => &["family"],
+        Defect::UnseenSubscriber | Defect::NeedlessRing | Defect::UnsentEvent => &["subscribers"],
     }
 }
 

@@ -6,9 +6,12 @@ use scanhub_schema::{MILLIS, Topic, Verb};
 use super::{Key, Kind, SENSOR};
 use crate::consumer::Habit;
 use crate::plan::Action;
+use crate::shared::{Change, Who};
 use crate::world::World;
 
 const TOPIC: Key = Key::new("topic", 0, 6);
+/// All topics of a link.
+const ANY_TOPIC: Key = Key::new("topic", 0, Topic::OF_LINKS.len() as u64 - 1);
 const HOLDS: Key = Key::new("holds", 0, 4);
 
 /// A subscriber attaches, and leaves after a while.
@@ -26,6 +29,35 @@ pub(super) const KILLED: Kind = Kind {
     keys: &[SENSOR, TOPIC, HOLDS, Key::new("every_ms", 0, 500), Key::new("span_ms", 10, 20_000)],
     act: |world, action| come(world, action, true),
 };
+
+/// A subscriber attaches between two samples of a scan, and leaves between two others. In a world with such actions, some
+/// topics have no other subscribers.
+pub(super) const AMID: Kind = Kind {
+    name: "consumer_amid",
+    per_minute: 20.0,
+    keys: &[
+        SENSOR,
+        ANY_TOPIC,
+        Key::new("habit", 0, 3),
+        Key::new("holds", 0, 4),
+        Key::new("sends", 0, 12),
+        Key::new("span_ms", 10, 20_000),
+    ],
+    act: come_amid,
+};
+
+fn come_amid(world: &mut World, action: &Action) {
+    let topic = Topic::OF_LINKS[action.value("topic") as usize % Topic::OF_LINKS.len()];
+    let habit = match action.value("habit") {
+        0 => Habit::Slow { every_ms: 50 },
+        1 => Habit::Listener,
+        _ => Habit::Prompt,
+    };
+    let (holds, span_ms) = (action.value("holds") as usize, action.value("span_ms"));
+    let what = Who::Comes { topic, habit, holds, span_ms };
+    let change = Change { sensor: world.sensor(action), sends: action.value("sends"), what };
+    world.shared.changes.borrow_mut().push(change);
+}
 
 /// A subscriber does not run for a while.
 pub(super) const STOPS: Kind = Kind {

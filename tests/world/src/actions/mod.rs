@@ -7,7 +7,7 @@ mod line;
 mod network;
 mod scanner;
 
-use scanhub_schema::Nanos;
+use scanhub_schema::{Nanos, Topic};
 use scanhub_sim::fault::Faults;
 
 use crate::plan::Action;
@@ -80,6 +80,7 @@ pub(crate) const KINDS: &[Kind] = &[
     scanner::DEAF,
     network::ROUTER_KILLED,
     line::ALTERED,
+    consumers::AMID,
 ];
 
 /// Returns whether gateway and listener of a world with these actions have a key.
@@ -90,6 +91,16 @@ pub(crate) fn have_key(actions: &[Action]) -> bool {
 /// Returns whether gateway and listener of a world with these actions are bridges with a router between them.
 pub(crate) fn are_bridges(actions: &[Action]) -> bool {
     !have_key(actions) && actions.iter().any(|action| action.name() == network::ROUTER_KILLED.name)
+}
+
+/// Returns the topics that lose their constant subscribers in a world with these actions. No judge needs them.
+pub(crate) fn lonely_topics(actions: &[Action], seed: u64) -> Vec<Topic> {
+    if actions.iter().all(|action| action.name() != consumers::AMID.name) {
+        return Vec::new();
+    }
+    let mut random = fastrand::Rng::with_seed(seed ^ 0xA31D_0000_0000_0000);
+    let topics = [Topic::Marks, Topic::Lines, Topic::Motion, Topic::Foreground, Topic::Background];
+    topics.into_iter().filter(|_| random.u8(..4) > 0).collect()
 }
 
 /// Returns the faults that `action` causes on its line from `now` on, if it affects bytes.

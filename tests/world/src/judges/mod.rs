@@ -10,6 +10,7 @@ mod numbers;
 mod recording;
 mod scanner;
 mod stamps;
+mod subscribers;
 mod turns;
 mod verdict;
 
@@ -64,6 +65,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(stamps::Stamps::new(sensors)),
         Box::new(lost::LostOnLine::new(sensors)),
         Box::new(stamps::Prompt::default()),
+        Box::new(subscribers::Subscribers::new(sensors.len())),
         Box::new(early::Early::default()),
         Box::new(recording::Recording::new(plan.seed)),
         Box::new(verdict::LocalVerdict::new(setup, plan)),

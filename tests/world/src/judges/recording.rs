@@ -95,7 +95,7 @@ impl Judge for Recording {
 
     fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
         match *event {
-            Event::Attached { consumer, sensor, topic, is_prompt: true } => {
+            Event::Attached { consumer, sensor, topic, is_prompt: true, .. } => {
                 let is_wanted = matches!(topic, Topic::Telegram | Topic::Status);
                 // The first one of each.
                 if is_wanted && self.consumers.values().all(|known| *known != (sensor, topic)) {

@@ -158,7 +158,7 @@ impl Judge for Prompt {
 
     fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
         match *event {
-            Event::Attached { consumer, sensor, topic, is_prompt } => {
+            Event::Attached { consumer, sensor, topic, is_prompt, .. } => {
                 self.followed.insert(consumer, (sensor, topic));
                 if is_prompt {
                     self.came.insert(consumer, at);

@@ -162,9 +162,10 @@ impl Source {
     /// Takes a place, if there is one.
     fn attach(&mut self, shared: &Shared) {
         let Source { sensor, topic, number, .. } = *self;
-        self.is_attached = shared.board.borrow_mut().attach(sensor, topic, number);
+        self.is_attached = shared.board.borrow_mut().attach(sensor, topic, number, false);
         if self.is_attached {
-            shared.tell(&Event::Attached { consumer: number, sensor, topic, is_prompt: false });
+            let (is_prompt, is_listener) = (false, false);
+            shared.tell(&Event::Attached { consumer: number, sensor, topic, is_prompt, is_listener });
         }
     }
 
