@@ -51,6 +51,12 @@ impl<'a> Packet<'a> {
         if start > TURN || end > TURN || packet.span() > WIDEST { Err(Reject::Angle) } else { Ok(packet) }
     }
 
+    /// Returns the packet in bytes that [`Packet::check`] has accepted before.
+    pub(crate) fn checked(bytes: &'a [u8; LEN]) -> Packet<'a> {
+        debug_assert!(Packet::check(bytes).is_ok());
+        Packet { bytes }
+    }
+
     /// Its bytes.
     pub fn bytes(&self) -> &'a [u8; LEN] {
         self.bytes

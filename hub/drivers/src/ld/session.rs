@@ -246,7 +246,7 @@ impl Session {
         let mut counted = None;
         let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
         for (number, bytes) in bytes.iter().enumerate() {
-            let Ok(packet) = Packet::check(bytes) else { continue };
+            let packet = Packet::checked(bytes);
             let place = self.sequence.place(&packet);
             counted = self.point_count.note(&packet, place).or(counted);
             self.measured = self.measured.or_else(|| self.point_count.typical());
@@ -345,7 +345,7 @@ impl Session {
     fn advance_turns(&mut self) -> Option<Closed> {
         while let Some(current) = &mut self.current {
             let (bytes, _) = self.framer.bytes(current.span).as_chunks::<LEN>();
-            let packet = bytes.get(current.packet).and_then(|bytes| Packet::check(bytes).ok());
+            let packet = bytes.get(current.packet).map(Packet::checked);
             let Some(packet) = packet.filter(|_| self.is_learned) else {
                 self.current = None;
                 return None;

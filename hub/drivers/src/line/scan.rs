@@ -197,8 +197,9 @@ impl Grid {
         for point in points {
             // Up to one more revolution on either side is accepted. The result is rounded to the nearest beam.
             let place = point.angle * bins_per_radian + (beams as f32 + 0.5);
-            // An angle that is not a number has no beam.
-            let mut bin = if place >= 0.0 { place as usize } else { usize::MAX };
+            // An angle that is not a number has no beam. 32 bits, because a conversion to 64 takes three times as long.
+            let measured = if place >= 0.0 { place as u32 as usize } else { usize::MAX };
+            let mut bin = measured;
             let mut angle = point.angle - TAU;
             for _ in 0..2 {
                 if bin >= beams {
@@ -213,8 +214,7 @@ impl Grid {
                 *range = point.range;
                 intensities[bin] = point.intensity;
                 // The angle is within the same revolution as that of its beam.
-                angles[bin] =
-                    if (beams..2 * beams).contains(&(place as usize)) { point.angle } else { angle };
+                angles[bin] = if (beams..2 * beams).contains(&measured) { point.angle } else { angle };
             }
         }
         collisions

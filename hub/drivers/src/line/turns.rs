@@ -158,8 +158,11 @@ impl<const N: usize> Turns<N> {
         open.last = open.last.max(time);
         open.reasons |= reasons;
         // If the first points are missing, the time at the edge is extrapolated.
-        let points = if pace.step > 0.0 { (within + self.edge) / pace.step } else { 0.0 };
-        open.first.get_or_insert((time - points * pace.point_ns).max(0.0));
+        let edge = self.edge;
+        open.first.get_or_insert_with(|| {
+            let points = if pace.step > 0.0 { (within + edge) / pace.step } else { 0.0 };
+            (time - points * pace.point_ns).max(0.0)
+        });
     }
 
     /// Records that points are missing between two angles.
