@@ -9,6 +9,8 @@ use std::f64::consts::TAU;
 
 use scanhub_schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
 
+use crate::background::position;
+
 /// Sector of the sensor's view in which parts of the robot itself are visible.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sector {
@@ -430,20 +432,25 @@ impl Table {
         let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
         let reach = (away + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
         let (mut met, mut best) = (Met::default(), (f64::INFINITY, None));
-        for (i, (&range, &angle)) in ranges.iter().zip(angles).enumerate() {
-            let value = f64::from(range);
-            let may_be_nearest = value * unit_mm - away <= best.0;
-            if range > self.layout.valid_to || !(may_be_nearest || value <= reach) {
-                continue;
-            }
+        // A greater range is neither inside a circle nor nearer than the nearest point so far.
+        let mut limit = self.layout.valid_to;
+        let mut next = 0;
+        while let Some(i) = position(ranges, next, |range| range <= limit)
+            && let Some(&angle) = angles.get(i)
+        {
+            next = i + 1;
+            let range = ranges[i];
             let beam = self.beam(f64::from(angle));
             if u64::from(range) < beam.own {
                 continue;
             }
+            let value = f64::from(range);
             let square = value * (value + 2.0 * beam.q / unit_mm);
             let distance_mm = (square * unit_mm * unit_mm + away * away).max(0.0).sqrt();
             if distance_mm < best.0 {
                 best = (distance_mm, Some((i, square)));
+                let farthest = ((distance_mm + away) / unit_mm).max(reach) as u16;
+                limit = limit.min(farthest.saturating_add(1));
             }
             for (zone, inside) in met.inside.iter_mut().enumerate().take(self.circles) {
                 let (from, below) = self.span(&beam, zone);
