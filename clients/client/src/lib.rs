@@ -5,6 +5,8 @@
 //!   restarts of the hub.
 //! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
 //!   [`Verdict::Unknown`].
+//! - `SubscriberBuilder::open_pollable` returns a subscriber with a descriptor for `poll` or an executor. With the feature
+//!   `tokio`, it is a stream.
 //! - [`publish`] creates a topic for other programs.
 //! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
 //! - [`streams`] is for programs that follow many topics in one thread.
@@ -40,6 +42,8 @@ mod publish;
 mod robot;
 mod sample;
 mod session;
+#[cfg(feature = "tokio")]
+mod stream;
 mod subscribe;
 mod wait;
 mod zones;

@@ -8,6 +8,8 @@ use scanhub_shm::Payload;
 use crate::error::Error;
 use crate::follower::Received;
 use crate::robot::{Robot, RobotSubscriber};
+#[cfg(feature = "tokio")]
+use crate::stream::Registration;
 use crate::subscribe::Subscriber;
 use crate::zones::{Heard, ZonesSubscriber};
 
@@ -41,21 +43,33 @@ pub type PollableSubscriber<P> = Pollable<Subscriber<P>>;
 ///
 /// It can be readable although nothing has arrived: once a second while a hub runs, and when another topic of the
 /// sensor has a sample. The descriptor stays the same for the subscriber's life, even if the hub restarts, and a
-/// program that the process starts does not inherit it.
+/// program that the process starts does not inherit it. With the feature `tokio`, the subscriber is a `Stream`.
 pub struct Pollable<T> {
     descriptor: Arc<OwnedFd>,
     // A lock, so that `try_next` works while an executor borrows the descriptor.
     subscriber: Mutex<T>,
+    #[cfg(feature = "tokio")]
+    registration: Registration,
 }
 
 impl<T> Pollable<T> {
     pub(crate) fn new(descriptor: Arc<OwnedFd>, subscriber: T) -> Pollable<T> {
-        Pollable { descriptor, subscriber: Mutex::new(subscriber) }
+        Pollable {
+            descriptor,
+            subscriber: Mutex::new(subscriber),
+            #[cfg(feature = "tokio")]
+            registration: Registration::default(),
+        }
     }
 
     /// Returns the subscriber, for example to wait with its `next`.
     pub fn get_mut(&mut self) -> &mut T {
         self.subscriber.get_mut().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    #[cfg(feature = "tokio")]
+    pub(crate) fn registration(&mut self) -> (&mut Registration, &Arc<OwnedFd>) {
+        (&mut self.registration, &self.descriptor)
     }
 
     fn locked(&self) -> MutexGuard<'_, T> {
@@ -70,6 +84,13 @@ impl<T> AsFd for Pollable<T> {
 }
 
 impl<T> AsRawFd for Pollable<T> {
+    fn as_raw_fd(&self) -> RawFd {
+        self.descriptor.as_raw_fd()
+    }
+}
+
+/// So that tokio's `AsyncFd` can borrow the subscriber.
+impl<T> AsRawFd for &Pollable<T> {
     fn as_raw_fd(&self) -> RawFd {
         self.descriptor.as_raw_fd()
     }

@@ -1,0 +1,36 @@
+//! Prints the beams of two sensors in tokio, and a line if one is silent for half a second. Ctrl-C ends it.
+
+use std::time::Duration;
+
+use futures_util::StreamExt;
+use scanhub_client::{Error, Scan, Subscriber};
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+const SILENCE: Duration = Duration::from_millis(500);
+
+async fn follow(sensor: &str) -> Result<(), Error> {
+    let mut scans = Subscriber::<Scan>::builder(sensor).open_pollable()?;
+    loop {
+        // The timeout drops the future; no scan is lost by that.
+        match timeout(SILENCE, scans.next()).await {
+            Ok(Some(scan)) => println!("{sensor}: {} beams", scan?.beams()),
+            Ok(None) => return Ok(()),
+            Err(_) => println!("{sensor}: silent; there is a hub: {}", scans.hub_is_running()),
+        }
+    }
+}
+
+#[tokio::main]
+pub(crate) async fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut tasks = JoinSet::new();
+    for sensor in ["front", "rear"] {
+        tasks.spawn(follow(sensor));
+    }
+    tokio::select! {
+        ended = tokio::signal::ctrl_c() => ended?,
+        Some(ended) = tasks.join_next() => ended??,
+    }
+    println!("end");
+    Ok(())
+}
