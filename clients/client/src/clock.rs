@@ -21,6 +21,11 @@ pub fn now_ns() -> u64 {
     read(ClockId::Monotonic)
 }
 
+/// Returns CLOCK_BOOTTIME alone, in ns.
+pub(crate) fn boottime_ns() -> u64 {
+    read(ClockId::Boottime)
+}
+
 /// Returns the wall clock, ns since 1970.
 pub fn wall_ns() -> u64 {
     read(ClockId::Realtime)

@@ -101,6 +101,9 @@ impl<P: Payload + ?Sized> Follower<P> {
             Ok(sample) => {
                 self.unconnected_since = None;
                 self.nothing_at = moment.filter(|_| sample.is_none());
+                if sample.is_some() {
+                    session.heard();
+                }
                 Ok(sample.map(|sample| self.account(sample)))
             }
             Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),

@@ -35,6 +35,7 @@ pub mod clock;
 mod control;
 mod error;
 mod follower;
+mod hub_monitor;
 mod join;
 mod pollable;
 mod presence;

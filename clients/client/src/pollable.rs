@@ -2,6 +2,7 @@
 
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use scanhub_shm::Payload;
 
@@ -41,8 +42,8 @@ pub type PollableSubscriber<P> = Pollable<Subscriber<P>>;
 /// Subscriber with a descriptor that is readable while there may be something to take. Poll it, never read it. While it
 /// is readable, `poll` returns at once, until `try_next` returns `None`.
 ///
-/// It can be readable although nothing has arrived: once a second while a hub runs, and when another topic of the
-/// sensor has a sample. The descriptor stays the same for the subscriber's life, even if the hub restarts, and a
+/// It can be readable although nothing has arrived: once a second while a hub runs, when another topic of the sensor has
+/// a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. The descriptor stays the same for the subscriber's life, even if the hub restarts, and a
 /// program that the process starts does not inherit it. With the feature `tokio`, the subscriber is a `Stream`.
 pub struct Pollable<T> {
     descriptor: Arc<OwnedFd>,
@@ -110,6 +111,11 @@ impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
+
+    /// As [`Subscriber::silent_for`].
+    pub fn silent_for(&self) -> Duration {
+        self.locked().silent_for()
+    }
 }
 
 impl Pollable<ZonesSubscriber> {
@@ -127,6 +133,11 @@ impl Pollable<ZonesSubscriber> {
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
+
+    /// As [`ZonesSubscriber::silent_for`].
+    pub fn silent_for(&self) -> Duration {
+        self.locked().silent_for()
+    }
 }
 
 impl Pollable<RobotSubscriber> {
@@ -143,5 +154,10 @@ impl Pollable<RobotSubscriber> {
     /// As [`RobotSubscriber::hub_is_running`].
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
+    }
+
+    /// As [`RobotSubscriber::silent_for`].
+    pub fn silent_for(&self) -> Duration {
+        self.locked().silent_for()
     }
 }

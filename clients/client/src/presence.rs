@@ -108,6 +108,21 @@ impl Presence {
         change
     }
 
+    /// Lets the next call of [`look`](Self::look) query the locks, because something has changed.
+    pub(crate) fn expire(&mut self) {
+        (self.looked_at, self.asked_at) = (None, None);
+    }
+
+    /// Returns the places where a hub may run.
+    pub(crate) fn places(&self) -> &[Domain] {
+        &self.places
+    }
+
+    /// Returns the process ID of the hub or listener, if one runs.
+    pub(crate) fn pid(&self) -> Option<u32> {
+        self.hub.as_ref().map(|holder| holder.pid)
+    }
+
     /// Returns the time of the last check.
     pub(crate) fn looked_at(&self) -> Option<Instant> {
         self.looked_at

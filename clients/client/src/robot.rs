@@ -159,6 +159,12 @@ impl RobotSubscriber {
         self.session.domain().is_some()
     }
 
+    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which the
+    /// machine was suspended counts (CLOCK_BOOTTIME).
+    pub fn silent_for(&self) -> Duration {
+        self.session.silent_for()
+    }
+
     /// Takes all samples that have arrived. Returns whether there were any.
     fn hear(&mut self) -> Result<bool, Error> {
         // Samples that have arrived come first, as with one sensor. But a program that always finds some must also

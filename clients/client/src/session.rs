@@ -14,7 +14,9 @@ use rustix::time::{
 use scanhub_schema::{Kind, Topic};
 use scanhub_shm::{Domain, Node, Payload, Role, Subscriber, ThreadSafeService, holder, is_starting};
 
+use crate::clock;
 use crate::error::Error;
+use crate::hub_monitor::HubMonitor;
 use crate::presence::{Change, Presence, Who};
 use crate::wait::{Wait, Wakeups};
 
@@ -32,9 +34,13 @@ pub struct Session {
     is_unsure: bool,
     number: u32,
     wait: Wait,
+    /// CLOCK_BOOTTIME at the last sample, or at the creation, in ns.
+    heard_ns: u64,
     /// For programs that poll the descriptor.
     readiness: Option<Readiness>,
-    subscribed_at: Option<Instant>,
+    /// Time until which the caller looks ten times a second: the hub creates its topics one after the other, and sends
+    /// samples to late joiners without an event.
+    quick_until: Option<Instant>,
 }
 
 struct Joined {
@@ -52,8 +58,9 @@ impl Session {
             is_unsure: false,
             number: 0,
             wait: Wait::default(),
+            heard_ns: clock::boottime_ns(),
             readiness: None,
-            subscribed_at: None,
+            quick_until: None,
         }
     }
 
@@ -82,7 +89,10 @@ impl Session {
                 _ => Ok(change),
             };
         };
-        self.is_unsure |= change.back.is_some();
+        if change.back.is_some() {
+            self.is_unsure = true;
+            self.quick_until = Some(Instant::now() + 2 * MAKE_SURE_EVERY);
+        }
         let is_here = self.joined.as_ref().is_some_and(|joined| joined.domain == *domain);
         if is_here && !self.is_unsure {
             return Ok(change);
@@ -114,6 +124,17 @@ impl Session {
     /// Returns who publishes there, as of the last look.
     pub fn publishes(&self) -> Option<Who> {
         self.presence.who()
+    }
+
+    /// Notes that a sample was received.
+    pub(crate) fn heard(&mut self) {
+        self.heard_ns = clock::boottime_ns();
+    }
+
+    /// Returns the time since a sample of any source was received; if there was none, since the session was created.
+    /// Time during which the machine was suspended counts.
+    pub fn silent_for(&self) -> Duration {
+        Duration::from_nanos(clock::boottime_ns().saturating_sub(self.heard_ns))
     }
 
     /// Returns whether a hub runs, and not only a listener that publishes the sensors of other machines.
@@ -163,7 +184,9 @@ impl Session {
         }
         let subscriber =
             P::open(&joined.node, sensor)?.map(|topic| P::subscriber(&joined.node, &topic)).transpose()?;
-        self.subscribed_at = subscriber.as_ref().map(|_| Instant::now());
+        if subscriber.is_some() {
+            self.quick_until = Some(Instant::now() + MAKE_SURE_EVERY);
+        }
         Ok(subscriber)
     }
 
@@ -190,20 +213,30 @@ impl Session {
         Ok(descriptor)
     }
 
-    /// Notes that the caller has received all samples, and waits until `left` has passed. The descriptor, if
-    /// it is used, is not readable until then. Returns whether samples were sent in the meantime; then the caller must
-    /// receive them first.
+    /// Notes that the caller has received all samples. The descriptor, if it is used, is not readable until something
+    /// changes or `left` has passed. Returns whether samples were sent, or a hub has started or ended, in the meantime.
+    /// Then the caller must look and receive first.
     ///
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn settle(&mut self, left: Option<Duration>) -> Result<bool, Error> {
-        let Some(readiness) = &self.readiness else { return Ok(false) };
-        // The hub sends samples to late joiners without an event.
-        let is_settled = self.subscribed_at.is_some_and(|at| at.elapsed() >= MAKE_SURE_EVERY);
-        let pace =
-            if is_settled && self.presence.domain().is_some() { MAKE_SURE_EVERY } else { LONGEST_WAIT };
-        readiness.again_in(left.map_or(pace, |left| left.min(pace)))?;
+        let Some(readiness) = &mut self.readiness else { return Ok(false) };
+        let is_changed = match self.presence.pid() {
+            Some(pid) => readiness.monitor.watch_hub(pid),
+            None => readiness.monitor.watch_directories(self.presence.places()),
+        };
+        if is_changed {
+            self.presence.expire();
+            return Ok(true);
+        }
+        let pace = match self.presence.pid() {
+            Some(_) if self.quick_until.is_some_and(|until| Instant::now() < until) => Some(LONGEST_WAIT),
+            Some(_) => Some(MAKE_SURE_EVERY),
+            None if self.presence.short().is_some() => Some(LONGEST_WAIT),
+            None => readiness.monitor.interval(),
+        };
+        readiness.again_in(pace.into_iter().chain(left).min())?;
         Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
     }
 
@@ -227,7 +260,7 @@ impl Session {
         // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
         // settled.
         if let Some(readiness) = &self.readiness {
-            readiness.again_in(Duration::ZERO)?;
+            readiness.again_in(Some(Duration::ZERO))?;
         }
         match &mut self.joined {
             Some(joined) => Ok(joined.wakeups.wait(&joined.node, left)?),
@@ -239,11 +272,13 @@ impl Session {
     }
 }
 
-/// Descriptor for programs that also wait for other things: an epoll over a timer and the events of each hub. It is
+/// Descriptor for programs that also wait for other things: an epoll over a timer, the events of each hub, and the
+/// start and end of hubs. It is
 /// readable while there may be something to receive or to check.
 struct Readiness {
     descriptor: Arc<OwnedFd>,
     clock: OwnedFd,
+    monitor: HubMonitor,
 }
 
 impl Readiness {
@@ -252,9 +287,9 @@ impl Readiness {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
         let descriptor = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).map_err(short)?);
-        let readiness = Readiness { descriptor, clock };
+        let readiness = Readiness { monitor: HubMonitor::new(descriptor.clone()), descriptor, clock };
         readiness.add(readiness.clock.as_fd())?;
-        readiness.again_in(Duration::ZERO)?;
+        readiness.again_in(Some(Duration::ZERO))?;
         Ok(readiness)
     }
 
@@ -268,10 +303,10 @@ impl Readiness {
         }
     }
 
-    /// Sets the timer: it makes the descriptor readable after `left`.
-    fn again_in(&self, left: Duration) -> Result<(), Error> {
-        // 0 would mean never.
-        let left = left.max(Duration::from_nanos(1));
+    /// Sets the timer: it makes the descriptor readable after `left`, or never.
+    fn again_in(&self, left: Option<Duration>) -> Result<(), Error> {
+        // 0 means never.
+        let left = left.map_or(Duration::ZERO, |left| left.max(Duration::from_nanos(1)));
         let it_value = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
         let once = Itimerspec { it_interval: Timespec { tv_sec: 0, tv_nsec: 0 }, it_value };
         timerfd_settime(&self.clock, TimerfdTimerFlags::empty(), &once).map(|_| ()).map_err(short)
@@ -301,9 +336,9 @@ mod tests {
     fn the_time_makes_it_readable_once() {
         let readiness = Readiness::new().unwrap();
         assert!(is_readable(&readiness, LONG), "nobody has looked yet");
-        readiness.again_in(LONG).unwrap();
+        readiness.again_in(Some(LONG)).unwrap();
         assert!(!is_readable(&readiness, Duration::ZERO));
-        readiness.again_in(Duration::from_millis(1)).unwrap();
+        readiness.again_in(Some(Duration::from_millis(1))).unwrap();
         assert!(is_readable(&readiness, LONG));
     }
 
@@ -318,7 +353,7 @@ mod tests {
     #[test]
     fn events_come_and_go() {
         let readiness = Readiness::new().unwrap();
-        readiness.again_in(LONG).unwrap();
+        readiness.again_in(Some(LONG)).unwrap();
         let (read, mut write) = pipe().unwrap();
         for _ in 0..2 {
             readiness.add(read.as_fd()).unwrap();

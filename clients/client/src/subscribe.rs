@@ -133,6 +133,12 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         self.session.domain().is_some()
     }
 
+    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which the
+    /// machine was suspended counts (CLOCK_BOOTTIME).
+    pub fn silent_for(&self) -> Duration {
+        self.session.silent_for()
+    }
+
     fn look(&mut self) -> Result<Option<Received<P>>, Error> {
         // Samples that have arrived come first, because the look for the hub takes longer than receiving.
         if self.follower.subscribed()

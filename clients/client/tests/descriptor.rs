@@ -4,6 +4,7 @@
 mod fake;
 
 use std::os::fd::{AsFd, AsRawFd};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
@@ -166,4 +167,91 @@ fn a_pollable_subscriber_can_wait_too() {
     hub.front().scan(&[1000]);
     assert_eq!(scans.get_mut().next().unwrap().expect("a scan").beams(), 1);
     assert!(is_readable(&scans, LONG), "the event is still to be taken");
+}
+
+/// Counts the wake-ups in 5 s as a program that takes everything has them, and the timeouts of `poll`.
+fn wake_ups_and_timeouts(scans: &PollableSubscriber<Scan>) -> (u32, u32) {
+    let (started, mut wake_ups, mut timeouts) = (Instant::now(), 0, 0);
+    while started.elapsed() < Duration::from_secs(5) {
+        match is_readable(scans, Duration::from_millis(500)) {
+            true => wake_ups += 1,
+            false => timeouts += 1,
+        }
+        assert!(scans.try_next().unwrap().is_none());
+    }
+    (wake_ups, timeouts)
+}
+
+#[test]
+fn without_a_hub_poll_times_out() {
+    let place = Place::new();
+    let scans = scans(&place);
+    assert!(is_readable(&scans, LONG), "it must look for a hub first");
+    assert!(scans.try_next().unwrap().is_none());
+    let (wake_ups, timeouts) = wake_ups_and_timeouts(&scans);
+    assert!(wake_ups <= 5 && timeouts > 0, "{wake_ups} wake-ups, {timeouts} timeouts");
+}
+
+#[test]
+fn files_of_others_wake_it_at_most_once_a_second() {
+    let place = Place::new();
+    let scans = scans(&place);
+    assert!(scans.try_next().unwrap().is_none());
+    let is_done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            for number in 0.. {
+                if is_done.load(Ordering::Relaxed) {
+                    break;
+                }
+                std::fs::write(place.base.join(format!("other{number}")), "").unwrap();
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        });
+        let (wake_ups, timeouts) = wake_ups_and_timeouts(&scans);
+        is_done.store(true, Ordering::Relaxed);
+        assert!(wake_ups <= 6 && timeouts > 0, "{wake_ups} wake-ups, {timeouts} timeouts");
+    });
+}
+
+#[test]
+fn a_hub_that_starts_makes_it_readable() {
+    let place = Place::new();
+    let scans = scans(&place);
+    assert!(scans.try_next().unwrap().is_none() && !is_readable(&scans, Duration::ZERO));
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    until("the hub", || {
+        assert!(is_readable(&scans, LONG), "without a timer");
+        scans.try_next().unwrap().is_none() && scans.hub_is_running()
+    });
+}
+
+#[test]
+fn a_sensor_that_does_not_exist_wakes_it_once_a_second() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    let scans = Subscriber::<Scan>::builder("frnot").in_domain(&place.domain).open_pollable().unwrap();
+    // In the first seconds, the hub may still create the topic.
+    let started = Instant::now();
+    while started.elapsed() < Duration::from_secs(3) {
+        is_readable(&scans, Duration::from_millis(100));
+        assert!(scans.try_next().unwrap().is_none());
+    }
+    let (wake_ups, timeouts) = wake_ups_and_timeouts(&scans);
+    assert!(wake_ups <= 7 && timeouts > 0, "{wake_ups} wake-ups, {timeouts} timeouts");
+}
+
+#[test]
+fn a_silence_is_measured_from_the_last_sample() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let scans = scans(&place);
+    until("the subscriber", || scans.try_next().unwrap().is_none() && hub.front().scan.subscribers() == 1);
+    let before = scans.silent_for();
+    std::thread::sleep(Duration::from_millis(20));
+    assert!(scans.silent_for() >= before + Duration::from_millis(20), "since it was opened");
+    let sent = Instant::now();
+    hub.front().scan(&[1000]);
+    let _scan = polled(&scans);
+    assert!(scans.silent_for() <= sent.elapsed());
 }

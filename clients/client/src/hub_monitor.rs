@@ -1,0 +1,329 @@
+//! Makes a descriptor readable when a hub starts or ends, so that a program that polls it needs no timer.
+//!
+//! Without a hub, inotify reports changes in the directories in which a hub creates its files. A directory that does not
+//! exist yet is watched for in the nearest one that exists. With a hub, a pidfd reports the end of its process.
+
+use std::ffi::{OsStr, OsString};
+use std::mem::MaybeUninit;
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, epoll, poll};
+use rustix::fs::inotify;
+use rustix::io::Errno;
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use scanhub_shm::Domain;
+
+/// Monitor of the hub of a domain. Its descriptors are part of an epoll.
+pub(crate) struct HubMonitor {
+    epoll: Arc<OwnedFd>,
+    /// The directories, while no hub runs. A user can have only about a hundred of these.
+    directories: Option<Directories>,
+    /// The hub's process ID, and its pidfd until it has ended.
+    hub: Option<(u32, Option<OwnedFd>)>,
+}
+
+/// Pause after a change that is not of a hub. In a directory such as /tmp, others can create files all the time.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// Interval of the looks for a hub if the directories cannot be watched.
+const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
+
+/// Files of a domain's directory that a hub or listener writes when it starts.
+const FILES: [&str; 3] = ["hub.lock", "listen.lock", "prefix"];
+
+impl HubMonitor {
+    pub(crate) fn new(epoll: Arc<OwnedFd>) -> HubMonitor {
+        HubMonitor { epoll, directories: None, hub: None }
+    }
+
+    /// Watches the process `pid` of the hub. Returns whether it has ended since the last call.
+    pub(crate) fn watch_hub(&mut self, pid: u32) -> bool {
+        self.directories = None;
+        if self.hub.as_ref().is_none_or(|(known, _)| *known != pid) {
+            // Without a pidfd, the timer looks for the hub.
+            let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
+            let opened = process.and_then(|pid| pidfd_open(pid, PidfdFlags::empty()).ok());
+            self.hub = Some((pid, opened.filter(|pidfd| add(&self.epoll, pidfd).is_ok())));
+        }
+        let Some((_, pidfd)) = &mut self.hub else { return false };
+        let has_ended = pidfd.as_ref().is_some_and(is_readable);
+        if has_ended {
+            *pidfd = None;
+        }
+        has_ended
+    }
+
+    /// Watches the directories in which a hub would appear at `places`. Returns whether something has changed since the
+    /// last call, so that the caller must look for a hub.
+    pub(crate) fn watch_directories(&mut self, places: &[Domain]) -> bool {
+        self.hub = None;
+        let (directories, is_new) = match &mut self.directories {
+            Some(directories) => (directories, false),
+            none => match Directories::new(&self.epoll) {
+                Ok(directories) => (none.insert(directories), true),
+                Err(_) => return false,
+            },
+        };
+        let change = directories.take();
+        if change == Change::Unrelated {
+            directories.pause(&self.epoll);
+        } else {
+            directories.resume(&self.epoll);
+        }
+        // In this order: a directory that was created after the first look is watched, or found by the next one.
+        directories.watch(places) || is_new || change == Change::Related
+    }
+
+    /// Returns the time after which the caller must look for a hub although nothing has changed. `None` if changes make
+    /// the descriptor readable.
+    pub(crate) fn interval(&self) -> Option<Duration> {
+        match &self.directories {
+            Some(Directories { paused_until: Some(until), .. }) => {
+                Some(until.saturating_duration_since(Instant::now()))
+            }
+            Some(directories) if directories.is_complete => None,
+            _ => Some(UNWATCHED_INTERVAL),
+        }
+    }
+}
+
+/// Directories that are watched by one inotify.
+struct Directories {
+    inotify: OwnedFd,
+    watches: Vec<Watch>,
+    /// Whether each directory that this user may read is watched.
+    is_complete: bool,
+    paused_until: Option<Instant>,
+}
+
+/// A directory to watch, with its number if it is watched.
+struct Watch {
+    target: Target,
+    number: Option<i32>,
+}
+
+/// A directory, and the entry in it that leads to a domain; `None` for the domain's directory itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Target {
+    directory: PathBuf,
+    entry: Option<OsString>,
+}
+
+/// Changes in the directories.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Change {
+    None,
+    /// Other files have changed.
+    Unrelated,
+    /// A file or directory of the domain has changed.
+    Related,
+}
+
+impl Directories {
+    fn new(epoll: &OwnedFd) -> Result<Directories, Errno> {
+        let inotify = inotify::init(inotify::CreateFlags::CLOEXEC | inotify::CreateFlags::NONBLOCK)?;
+        add(epoll, &inotify)?;
+        Ok(Directories { inotify, watches: Vec::new(), is_complete: true, paused_until: None })
+    }
+
+    /// Watches for `places`. Returns whether the directories have changed since the last call.
+    fn watch(&mut self, places: &[Domain]) -> bool {
+        let targets: Vec<Target> = places.iter().map(|place| Target::of(place.root())).collect();
+        if self.watches.iter().map(|watch| &watch.target).eq(&targets) {
+            return false;
+        }
+        let old = std::mem::take(&mut self.watches);
+        self.is_complete = true;
+        for target in targets {
+            let number = match inotify::add_watch(&self.inotify, &target.directory, target.flags()) {
+                Ok(number) => Some(number),
+                // It was removed, or belongs to another user, who then has its hub.
+                Err(Errno::NOENT | Errno::NOTDIR | Errno::ACCESS) => None,
+                Err(_) => {
+                    self.is_complete = false;
+                    None
+                }
+            };
+            self.watches.push(Watch { target, number });
+        }
+        for number in old.into_iter().filter_map(|watch| watch.number) {
+            if !self.watches.iter().any(|watch| watch.number == Some(number)) {
+                // A directory that was removed is not watched any more.
+                let _ = inotify::remove_watch(&self.inotify, number);
+            }
+        }
+        true
+    }
+
+    /// Takes all pending changes.
+    fn take(&mut self) -> Change {
+        let mut buffer = [MaybeUninit::uninit(); 4096];
+        let mut reader = inotify::Reader::new(&self.inotify, &mut buffer);
+        let mut change = Change::None;
+        let mut is_lost = false;
+        while let Ok(event) = reader.next() {
+            let mut watches = self.watches.iter().filter(|watch| watch.number == Some(event.wd()));
+            let name = event.file_name().map(|name| OsStr::from_bytes(name.to_bytes()));
+            if event.events().intersects(LOST) {
+                // A watch that was removed on purpose is not in the list any more.
+                is_lost |=
+                    event.events().contains(inotify::ReadFlags::QUEUE_OVERFLOW) || watches.next().is_some();
+            } else if watches.any(|watch| watch.target.leads(name)) {
+                change = Change::Related;
+            } else if change == Change::None {
+                change = Change::Unrelated;
+            }
+        }
+        if is_lost {
+            self.watches.clear();
+            change = Change::Related;
+        }
+        change
+    }
+
+    /// Stops watching for a moment, unless it has done so.
+    fn pause(&mut self, epoll: &OwnedFd) {
+        if self.paused_until.is_none_or(|until| until <= Instant::now()) {
+            let nothing = epoll::EventFlags::empty();
+            let _ = epoll::modify(epoll, &self.inotify, epoll::EventData::new_u64(0), nothing);
+            self.paused_until = Some(Instant::now() + PAUSE);
+        }
+    }
+
+    /// Watches again after a pause.
+    fn resume(&mut self, epoll: &OwnedFd) {
+        if self.paused_until.is_some_and(|until| until <= Instant::now()) {
+            let input = epoll::EventFlags::IN;
+            let _ = epoll::modify(epoll, &self.inotify, epoll::EventData::new_u64(0), input);
+            self.paused_until = None;
+        }
+    }
+}
+
+/// Events after which a directory may not be watched any more.
+const LOST: inotify::ReadFlags = inotify::ReadFlags::IGNORED
+    .union(inotify::ReadFlags::DELETE_SELF)
+    .union(inotify::ReadFlags::MOVE_SELF)
+    .union(inotify::ReadFlags::UNMOUNT)
+    .union(inotify::ReadFlags::QUEUE_OVERFLOW);
+
+impl Target {
+    /// Returns the directory `root` of a domain, or the nearest one above it that exists.
+    fn of(root: &Path) -> Target {
+        if root.is_dir() {
+            return Target { directory: root.to_owned(), entry: None };
+        }
+        let mut path = root;
+        while let (Some(above), Some(name)) = (path.parent(), path.file_name()) {
+            if above.is_dir() {
+                return Target { directory: above.to_owned(), entry: Some(name.to_owned()) };
+            }
+            path = above;
+        }
+        Target { directory: PathBuf::from("/"), entry: None }
+    }
+
+    fn flags(&self) -> inotify::WatchFlags {
+        use inotify::WatchFlags as W;
+        let always = W::CREATE | W::MOVED_TO | W::DELETE_SELF | W::MOVE_SELF | W::ONLYDIR | W::MASK_ADD;
+        if self.entry.is_none() { always | W::MODIFY | W::CLOSE_WRITE } else { always }
+    }
+
+    /// Returns whether the entry `name` leads to a hub.
+    fn leads(&self, name: Option<&OsStr>) -> bool {
+        match &self.entry {
+            Some(entry) => name == Some(entry),
+            None => name.is_some_and(|name| FILES.iter().any(|file| name == *file)),
+        }
+    }
+}
+
+fn add(epoll: &OwnedFd, descriptor: &OwnedFd) -> Result<(), Errno> {
+    epoll::add(epoll, descriptor, epoll::EventData::new_u64(0), epoll::EventFlags::IN)
+}
+
+fn is_readable(descriptor: &OwnedFd) -> bool {
+    let mut fds = [PollFd::from_borrowed_fd(descriptor.as_fd(), PollFlags::IN)];
+    poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 })) == Ok(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::process::Command;
+
+    use super::*;
+
+    /// Far longer than anything takes on a busy machine.
+    const LONG: Timespec = Timespec { tv_sec: 60, tv_nsec: 0 };
+
+    fn monitor() -> HubMonitor {
+        HubMonitor::new(Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC).unwrap()))
+    }
+
+    fn becomes_readable(monitor: &HubMonitor, within: Timespec) -> bool {
+        poll(&mut [PollFd::new(&monitor.epoll, PollFlags::IN)], Some(&within)) == Ok(1)
+    }
+
+    const NOW: Timespec = Timespec { tv_sec: 0, tv_nsec: 0 };
+
+    #[test]
+    fn each_directory_on_the_way_to_a_hub_is_a_change() {
+        let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
+        let places = [Domain::at("lab", &base.path().join("a/b")).unwrap()];
+        let mut monitor = monitor();
+        assert!(monitor.watch_directories(&places), "they are watched from now on");
+        assert!(!monitor.watch_directories(&places) && !becomes_readable(&monitor, NOW));
+        for path in ["a", "a/b", "a/b/lab", "a/b/lab/hub.lock"] {
+            let path = base.path().join(path);
+            match path.extension() {
+                None => fs::create_dir(path).unwrap(),
+                Some(_) => fs::write(path, "1").unwrap(),
+            }
+            assert!(becomes_readable(&monitor, LONG));
+            assert!(monitor.watch_directories(&places));
+            while monitor.watch_directories(&places) {}
+            assert!(!becomes_readable(&monitor, NOW));
+        }
+        fs::remove_dir_all(base.path().join("a")).unwrap();
+        assert!(becomes_readable(&monitor, LONG) && monitor.watch_directories(&places));
+        while monitor.watch_directories(&places) {}
+        fs::create_dir_all(base.path().join("a/b/lab")).unwrap();
+        assert!(becomes_readable(&monitor, LONG), "it watches where the directory was");
+        assert_eq!(monitor.interval(), None);
+    }
+
+    #[test]
+    fn files_of_others_make_it_pause() {
+        let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
+        let places = [Domain::at("lab", base.path()).unwrap()];
+        let mut monitor = monitor();
+        while monitor.watch_directories(&places) {}
+        fs::write(base.path().join("other"), "").unwrap();
+        assert!(becomes_readable(&monitor, LONG));
+        assert!(!monitor.watch_directories(&places), "it is not the domain");
+        fs::write(base.path().join("another"), "").unwrap();
+        assert!(!becomes_readable(&monitor, NOW), "it pauses");
+        let interval = monitor.interval().expect("it must look after the pause");
+        assert!(interval <= PAUSE);
+        fs::create_dir(base.path().join("lab")).unwrap();
+        std::thread::sleep(interval);
+        assert!(monitor.watch_directories(&places), "nothing is lost by the pause");
+    }
+
+    #[test]
+    fn the_end_of_a_hub_is_a_change_once() {
+        let mut monitor = monitor();
+        let mut hub = Command::new("sleep").arg("600").spawn().unwrap();
+        assert!(!monitor.watch_hub(hub.id()) && !becomes_readable(&monitor, NOW));
+        hub.kill().unwrap();
+        assert!(becomes_readable(&monitor, LONG));
+        assert!(monitor.watch_hub(hub.id()) && !monitor.watch_hub(hub.id()));
+        assert!(!becomes_readable(&monitor, NOW));
+        hub.wait().unwrap();
+    }
+}
