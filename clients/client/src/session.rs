@@ -205,7 +205,7 @@ impl Session {
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
-    pub(crate) fn pollable(&mut self) -> Result<Arc<OwnedFd>, Error> {
+    pub fn pollable(&mut self) -> Result<Arc<OwnedFd>, Error> {
         self.wait = Wait::Event;
         let readiness = Readiness::new()?;
         let descriptor = readiness.descriptor.clone();

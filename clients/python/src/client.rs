@@ -1,11 +1,12 @@
 //! The only contact with the client library: subscriptions to several topics or to the verdict of a robot, and the samples
 //! that a program keeps.
 //!
-//! Ports and samples of the client library belong to one thread. A program may use a subscription, and drop its samples, in any
-//! thread. So a subscription and all samples that it received are behind one mutex.
+//! A program may use a subscription, and drop its samples, in any thread. So a subscription and all samples that it received
+//! are behind one mutex.
 #![allow(unsafe_code)]
 
 use std::mem;
+use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::PathBuf;
 use std::process;
 use std::ptr;
@@ -15,11 +16,14 @@ use std::time::Duration;
 
 use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, Who, find};
 use scanhub_client::{
-    Domain, Environment, Failure, Header, Kind, Publication, Robot, RobotFollower, Tilt, Topic, Wait,
+    Domain, Environment, ErrorKind, Header, Pollable, Publication, Robot, RobotSubscriber, SubscriberBuilder,
+    Tilt, Topic, Wait,
 };
-use scanhub_schema::limits;
+use scanhub_schema::{Failure, limits};
 
 use crate::error::Error;
+
+type ClientError = scanhub_client::Error;
 
 /// Maximum time of one wait. After it, the caller handles signals.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
@@ -55,7 +59,7 @@ impl Place {
     fn home(&self) -> Result<Domain, Error> {
         match self.root {
             Some(_) => Ok(self.candidates()?.remove(0)),
-            None => Ok(scanhub_client::home(self.domain.as_deref())?),
+            None => Ok(scanhub_client::publish_domain(self.domain.as_deref())?),
         }
     }
 
@@ -73,12 +77,6 @@ pub(crate) struct Confined<T> {
     process: u32,
     busy: AtomicBool,
 }
-
-// SAFETY: The value is reached only through the mutex, and nothing outside of it shares its reference counts: the session,
-// its ports and the samples that they received are parts of one value. None of them depends on the thread that created it.
-unsafe impl<T> Send for Confined<T> {}
-// SAFETY: As above.
-unsafe impl<T> Sync for Confined<T> {}
 
 impl<T> Confined<T> {
     pub(crate) fn new(value: T) -> Confined<T> {
@@ -144,7 +142,7 @@ impl Drop for Reserved<'_> {
 }
 
 /// A source of items, with or without a descriptor to poll.
-pub(crate) trait Follow: Sized {
+pub(crate) trait Follow: Sized + Send {
     /// Received item.
     type Item;
 
@@ -184,6 +182,8 @@ pub(crate) struct Topics {
     /// Index of the source that is next in the round, so that no topic waits for the samples of another one.
     turn: usize,
     wait: Option<Wait>,
+    /// Descriptor to poll, if the subscription waits by event.
+    descriptor: Option<Arc<OwnedFd>>,
     /// Samples that the program keeps, with the indexes of their sources.
     kept: Vec<Option<(usize, AnySample)>>,
     /// Indexes of the kept samples that the program has dropped.
@@ -230,6 +230,7 @@ impl Topics {
             sources: sources.collect(),
             turn: 0,
             wait: None,
+            descriptor: None,
             kept: Vec::new(),
             dropped: Arc::default(),
             notices: Vec::new(),
@@ -370,13 +371,10 @@ impl Follow for Topics {
 
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
-            let session = mem::replace(&mut self.session, Session::new(Vec::new()));
-            (self.session, self.wait) = (session.by(Wait::Event), Some(Wait::Event));
+            self.descriptor = Some(self.session.pollable()?);
+            self.wait = Some(Wait::Event);
         }
-        if self.wait != Some(Wait::Event) {
-            return Err(Error::mixed());
-        }
-        Ok(number_of(self.session.descriptor()?))
+        self.descriptor.as_ref().map(|descriptor| descriptor.as_raw_fd()).ok_or_else(Error::mixed)
     }
 
     fn hub_lives(&self) -> bool {
@@ -456,7 +454,12 @@ impl Drop for Held {
 
 /// Subscription to the verdict of a robot.
 pub(crate) struct Verdicts {
-    robot: RobotFollower,
+    sensors: Vec<String>,
+    place: Place,
+    early: bool,
+    robot: RobotSubscriber,
+    /// Takes the place of `robot` if the program polls.
+    pollable: Option<Pollable<RobotSubscriber>>,
     wait: Option<Wait>,
 }
 
@@ -477,13 +480,18 @@ impl Default for Verdict {
 
 impl Verdicts {
     pub(crate) fn new(sensors: &[&str], place: &Place, early: bool) -> Result<Verdicts, Error> {
-        let robot = RobotFollower::in_domain(place.candidates()?, sensors)?;
-        Ok(Verdicts { robot: if early { robot.with_early() } else { robot }, wait: None })
+        let robot = builder(sensors, place, early).open()?;
+        let sensors = sensors.iter().map(|&sensor| sensor.to_owned()).collect();
+        Ok(Verdicts { sensors, place: place.clone(), early, robot, pollable: None, wait: None })
     }
 
     /// Returns what is known now. Never waits.
     pub(crate) fn now(&mut self) -> Result<Verdict, Error> {
-        Ok(verdict(self.robot.now()?))
+        Ok(verdict(self.subscriber().now()?))
+    }
+
+    fn subscriber(&mut self) -> &mut RobotSubscriber {
+        self.pollable.as_mut().map_or(&mut self.robot, Pollable::get_mut)
     }
 }
 
@@ -494,28 +502,37 @@ impl Follow for Verdicts {
         let mut value = this.lock();
         let Some(verdicts) = value.as_mut() else { return Ok(None) };
         verdicts.wait = verdicts.wait.or(Some(Wait::Doorbell));
-        Ok(verdicts.robot.try_next()?.map(verdict))
+        Ok(verdicts.subscriber().try_next()?.map(verdict))
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        Ok(self.robot.wait(longest.min(LONGEST_WAIT))?)
+        Ok(self.subscriber().wait(longest.min(LONGEST_WAIT))?)
     }
 
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
-            // Nothing was received, so another follower misses nothing.
-            let none = RobotFollower::in_domain(Vec::new(), &[])?;
-            let robot = mem::replace(&mut self.robot, none);
-            (self.robot, self.wait) = (robot.wait_by(Wait::Event), Some(Wait::Event));
+            // Nothing was received, so another subscriber misses nothing.
+            let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
+            self.pollable = Some(builder(&sensors, &self.place, self.early).open_pollable()?);
+            self.wait = Some(Wait::Event);
         }
-        if self.wait != Some(Wait::Event) {
-            return Err(Error::mixed());
-        }
-        Ok(number_of(self.robot.descriptor()?))
+        self.pollable.as_ref().map(AsRawFd::as_raw_fd).ok_or_else(Error::mixed)
     }
 
     fn hub_lives(&self) -> bool {
-        self.robot.hub_lives()
+        match &self.pollable {
+            Some(pollable) => pollable.hub_is_running(),
+            None => self.robot.hub_is_running(),
+        }
+    }
+}
+
+fn builder(sensors: &[&str], place: &Place, early: bool) -> SubscriberBuilder<RobotSubscriber> {
+    let builder = RobotSubscriber::builder(sensors).domain(place.name());
+    let builder = if early { builder.early() } else { builder };
+    match &place.root {
+        Some(root) => builder.root(root),
+        None => builder,
     }
 }
 
@@ -526,11 +543,6 @@ fn verdict(robot: &Robot) -> Verdict {
         nearest: robot.nearest().map(|(mm, sensor)| (mm, sensor.to_owned())),
         sensors: robot.sensors().map(|(sensor, verdict)| (sensor.to_owned(), verdict.name())).collect(),
     }
-}
-
-fn number_of(descriptor: std::os::fd::BorrowedFd<'_>) -> i32 {
-    use std::os::fd::AsRawFd;
-    descriptor.as_raw_fd()
 }
 
 /// Published angles of a mount.
@@ -566,53 +578,57 @@ pub(crate) fn topics(place: &Place) -> Result<Vec<(String, String)>, Error> {
 
 impl From<Failure> for Error {
     fn from(failure: Failure) -> Error {
-        let class = match failure.kind {
-            Kind::NoHub => "NoHub",
-            Kind::NoTopic => "NoTopic",
-            Kind::Short => "Short",
-            Kind::Configuration | Kind::Usage => "Impossible",
-            Kind::NameHeld | Kind::DomainHeld => "Taken",
-            Kind::Timeout => "Silent",
+        ClientError::from(failure).into()
+    }
+}
+
+impl From<ClientError> for Error {
+    fn from(error: ClientError) -> Error {
+        let message = error.message();
+        let class = match error.kind() {
+            ErrorKind::NoHub => "NoHub",
+            ErrorKind::NoTopic => "NoTopic",
+            ErrorKind::ResourceExhausted => "Short",
+            ErrorKind::InvalidInput => "Impossible",
+            ErrorKind::NameHeld | ErrorKind::DomainHeld => "Taken",
+            ErrorKind::Timeout => "Silent",
             // The client library has no kinds for these yet.
-            _ if failure.message.contains("belongs to user") => "Denied",
-            _ if failure.message.contains("another layout") || failure.message.contains("iceoryx2") => {
-                "Mismatch"
-            }
+            _ if message.contains("belongs to user") => "Denied",
+            _ if message.contains("another layout") || message.contains("iceoryx2") => "Mismatch",
             _ => "Failure",
         };
-        Error::new(class, failure.message, failure.hint)
+        Error::new(class, message, error.remedy())
     }
 }
 
 impl Error {
     /// Returns the error for a hub that was not found.
-    pub(crate) fn of_hub(failure: Failure) -> Error {
-        let Failure { message, hint, .. } = &failure;
-        match message.contains("belongs to user") {
-            true => Error::new("Denied", message, hint),
-            false => failure.into(),
+    pub(crate) fn of_hub(error: ClientError) -> Error {
+        match error.message().contains("belongs to user") {
+            true => Error::new("Denied", error.message(), error.remedy()),
+            false => error.into(),
         }
     }
 
     /// Returns the error for a domain that belongs to another user. `None` for another failure.
-    fn denied(failure: Failure) -> Option<Error> {
-        let error = Error::of_hub(failure);
+    fn denied(error: ClientError) -> Option<Error> {
+        let error = Error::of_hub(error);
         (error.class == "Denied").then_some(error)
     }
 
     /// Returns the error for a name under which the program cannot publish.
-    fn of_name(failure: Failure) -> Error {
-        match failure.message.contains("is published by") {
-            true => Error::new("Taken", failure.message, failure.hint),
-            false => failure.into(),
+    fn of_name(error: ClientError) -> Error {
+        match error.message().contains("is published by") {
+            true => Error::new("Taken", error.message(), error.remedy()),
+            false => error.into(),
         }
     }
 
     /// Returns the error for a request that the hub refused.
-    pub(crate) fn of_request(failure: Failure) -> Error {
-        match failure.kind {
-            Kind::Failed => Error::new("Refused", failure.message, failure.hint),
-            _ => failure.into(),
+    pub(crate) fn of_request(error: ClientError) -> Error {
+        match error.kind() {
+            ErrorKind::Failed => Error::new("Refused", error.message(), error.remedy()),
+            _ => error.into(),
         }
     }
 
