@@ -34,9 +34,10 @@ pub(crate) struct Diagnosis<'a> {
     byte_rate: ByteRate,
     /// Family of the scanner. `None` while the session searches for it.
     family: Option<Family>,
-    /// Number of telegrams of the session, and the time of the scanner's last one. `None` before the first one.
-    telegrams: u64,
+    /// Time of the scanner's last telegram. `None` before the first one.
     last_telegram: Option<Nanos>,
+    /// Time of a telegram since the last update.
+    new_telegram: Option<Nanos>,
     /// Whether the scanner has streamed since the port was opened.
     has_streamed: bool,
     /// Message that the scanner was exchanged, until the next one is found. Otherwise empty.
@@ -93,8 +94,8 @@ impl<'a> Diagnosis<'a> {
             device: None,
             byte_rate: ByteRate::default(),
             family: None,
-            telegrams: 0,
             last_telegram: None,
+            new_telegram: None,
             has_streamed: false,
             exchange: String::new(),
             now: 0,
@@ -151,9 +152,7 @@ impl<'a> Diagnosis<'a> {
         if session.family() != self.family {
             (self.family, self.last_telegram, self.has_streamed) = (session.family(), None, false);
         }
-        if account.telegrams != self.telegrams {
-            (self.telegrams, self.last_telegram) = (account.telegrams, Some(now));
-        }
+        self.last_telegram = self.new_telegram.take().or(self.last_telegram);
         if session.state() == line::State::Streaming {
             self.has_streamed = true;
             self.byte_rate = ByteRate::default();
@@ -183,7 +182,7 @@ impl<'a> Diagnosis<'a> {
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
-        (self.telegrams, self.last_telegram, self.has_streamed) = (0, None, false);
+        (self.last_telegram, self.new_telegram, self.has_streamed) = (None, None, false);
         self.exchange.clear();
         // This describes the previous connection.
         self.damaged_percent = None;
@@ -206,6 +205,16 @@ impl<'a> Diagnosis<'a> {
             }
         };
         self.altered = Some(Altered { alteration, message, until: now + ALTERED_SHOWN });
+    }
+
+    /// Notes a telegram that arrived at `now`.
+    pub(crate) fn note_telegram(&mut self, now: Nanos) {
+        self.new_telegram = Some(now);
+    }
+
+    /// Returns whether the message must be made again.
+    pub(crate) fn is_outdated(&self) -> bool {
+        self.facts.is_none()
     }
 
     /// Returns the message about the problem; an empty string if there is none.

@@ -157,7 +157,6 @@ impl<'a, S: Platform> LinkCore<'a, S> {
                 self.output.topics.wake(Wake::Status);
             }
             self.save_background(false);
-            self.output.topics.look();
             self.diagnosis.note_line(self.stats.health());
             self.diagnosis
                 .note_starved_subscribers(self.output.topics.starved_subscribers(self.stats.is_streaming()));
@@ -200,12 +199,14 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     /// function delivers.
     pub(crate) fn is_over(&mut self, woken: WakeReason, until: Nanos) -> bool {
         self.stats.wakeups += 1;
+        if woken != WakeReason::Timeout {
+            return true;
+        }
         let now = self.platform.now();
-        let is_over = woken != WakeReason::Timeout || now >= until;
-        if !is_over {
+        if now < until {
             self.deliver_history(now);
         }
-        is_over
+        now >= until
     }
 
     /// Handles the requests of users, and applies changed settings.
@@ -247,14 +248,21 @@ impl<'a, S: Platform> LinkCore<'a, S> {
 /// several states is logged once.
 fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     let before = stats.last().last_error_text;
-    let (changed, name) = (stats.update(state, error, now), &link.name);
+    let changed = stats.update(state, error, now);
+    if changed {
+        let is_logged = stats.last().last_error_text == before;
+        log_state(&link.name, state, if is_logged { "" } else { error });
+    }
+    changed
+}
+
+/// Logs `state` and, unless it is empty, `error`.
+#[cold]
+fn log_state(name: &str, state: State, error: &str) {
     match error {
-        _ if !changed => {}
-        _ if stats.last().last_error_text == before => tracing::info!("{name}: {}", state.name()),
         "" => tracing::info!("{name}: {}", state.name()),
         error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
-    changed
 }
 
 /// Does the same as [`update`] during a search. Its errors may change often, because of the bytes per second in them,

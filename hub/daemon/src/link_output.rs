@@ -9,13 +9,13 @@
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
 use scanhub_schema::{
-    Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Ring, Scan, Verb, Wake, Zones,
+    Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Scan, Verb, Wake, Zones,
 };
 
 use crate::early::{EarlyMessage, EarlyWarner};
 use crate::pipeline::{BackgroundReset, Pipeline, ResultBuffers};
 use crate::platform::Platform;
-use crate::topics::{Publishers, Topics};
+use crate::topics::{Stage, Topics};
 
 /// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
 #[derive(Clone, Copy, Debug, Default)]
@@ -105,9 +105,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // A withdrawal has the sequence number that this telegram gets.
         self.withdraw(Some(whole.number));
         self.topics.telegram(received, period_us);
-        if !self.topics.publishers.scan.has_subscribers() && !self.topics.publishers.zones.has_subscribers() {
-            self.topics.ring(Ring::First);
-        }
+        self.topics.end_stage(Stage::Telegram);
         let measured_ns = recorded.measured_ns;
         let publish = |scan| self.publish_scan(scan, measured_ns, period_us, is_backlogged);
         let verdict_lifetime = whole.scan.as_ref().map(publish);
@@ -156,7 +154,6 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         is_backlogged: bool,
     ) -> Nanos {
         let LinkOutput { topics, pipeline, scan, .. } = self;
-        let last_awaited = Stage::last_awaited(topics);
 
         // Decode and send the scan. The sample is a copy, because the processors read the scan after the sample was sent.
         let len = raw.payload_len();
@@ -167,12 +164,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         }
         let header = topics.header();
         topics.publishers.scan.send(scan_sample, &header, &mut topics.due);
-        if !topics.publishers.zones.has_subscribers() {
-            topics.ring(Ring::First);
-        }
-        if last_awaited == Stage::Scan {
-            topics.wake(Wake::Telegram);
-        }
+        topics.end_stage(Stage::Scan);
 
         // Zones.
         let mut zones = topics.publishers.zones.loan(0);
@@ -180,13 +172,34 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         pipeline.zones.doubt(is_backlogged);
         pipeline.check_zones(scan, zones.payload_mut());
         topics.publishers.zones.send(zones, &header, &mut topics.due);
-        // A subscriber that attached during this scan may get the zones, which have a history.
-        let is_late = topics.ring(Ring::First) && last_awaited == Stage::Scan;
-        if is_late || last_awaited == Stage::Zones {
-            topics.wake(Wake::Telegram);
-        }
+        topics.end_stage(Stage::Zones);
 
         // Marks, lines and motion.
+        let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
+        if topics.awaits(Stage::Results) {
+            self.publish_results(raw, measured_ns, &header);
+        } else {
+            pipeline.process(scan, measured_ns, raw.period, ResultBuffers::default());
+            topics.publishers.marks.skip();
+            topics.publishers.lines.skip();
+            topics.publishers.motion.skip();
+        }
+
+        // Foreground and background.
+        self.update_background(&header);
+        self.topics.end_stage(Stage::Background);
+        // A subscriber that attached during this scan may have received zones or a background, which have a history.
+        if self.topics.is_ring_due() {
+            self.topics.wake(Wake::Telegram);
+        }
+        self.note_published(raw, period_us)
+    }
+
+    /// Computes and sends marks, lines and motion of the scan, which `raw` contains and which was measured at
+    /// `measured_ns`.
+    #[inline(never)]
+    fn publish_results(&mut self, raw: &RawScan<'_>, measured_ns: Nanos, header: &Header) {
+        let LinkOutput { topics, pipeline, scan, .. } = self;
         let mut marks = topics.publishers.marks.loan(0);
         let mut lines = topics.publishers.lines.loan(0);
         let mut motion = topics.publishers.motion.loan(0);
@@ -195,38 +208,41 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
             lines: lines.payload_mut(),
             motion: motion.payload_mut(),
         };
-        let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
         pipeline.process(scan, measured_ns, raw.period, results);
-        topics.publishers.marks.send(marks, &header, &mut topics.due);
-        topics.publishers.lines.send(lines, &header, &mut topics.due);
-        topics.publishers.motion.send(motion, &header, &mut topics.due);
-        if last_awaited == Stage::Motion {
-            topics.wake(Wake::Telegram);
-        }
-
-        // Foreground and background.
-        self.update_background(&header);
-        if last_awaited == Stage::Background || self.topics.is_ring_due() {
-            self.topics.wake(Wake::Telegram);
-        }
-        self.note_published(raw, period_us)
+        topics.publishers.marks.send(marks, header, &mut topics.due);
+        topics.publishers.lines.send(lines, header, &mut topics.due);
+        topics.publishers.motion.send(motion, header, &mut topics.due);
+        topics.end_stage(Stage::Results);
     }
 
     /// Updates the background from the scan, and sends foreground and background.
     fn update_background(&mut self, header: &Header) {
-        let LinkOutput { topics, pipeline, scan, .. } = self;
-        if !pipeline.has_background() {
+        if !self.pipeline.has_background() {
             return;
         }
-        let mut foreground = topics.publishers.foreground.loan(Foreground::len(scan.beams()));
-        let reset = pipeline.learn(scan, foreground.payload_mut());
-        topics.publishers.foreground.send(foreground, header, &mut topics.due);
-        if pipeline.publishes_every_scan() || pipeline.is_background_due() {
+        let reset = if self.topics.awaits(Stage::Background) {
+            self.publish_foreground(header)
+        } else {
+            self.topics.publishers.foreground.skip();
+            self.pipeline.learn(&self.scan, None)
+        };
+        if self.pipeline.publishes_every_scan() || self.pipeline.is_background_due() {
             self.send_background(header);
         }
         if let Some(reason) = reset {
             log_reset(&self.link.name, reason);
         }
+    }
+
+    /// Updates the background from the scan, and sends the foreground. Returns a reason if the background is learned
+    /// again.
+    #[inline(never)]
+    fn publish_foreground(&mut self, header: &Header) -> Option<BackgroundReset> {
+        let LinkOutput { topics, pipeline, scan, .. } = self;
+        let mut foreground = topics.publishers.foreground.loan(Foreground::len(scan.beams()));
+        let reset = pipeline.learn(scan, foreground.payload_mut());
+        topics.publishers.foreground.send(foreground, header, &mut topics.due);
+        reset
     }
 
     /// Updates what depends on the last scan. Returns how long the verdict on it is valid.
@@ -398,36 +414,10 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         is_due
     }
 
+    #[inline(never)]
     fn send_background(&mut self, header: &Header) {
         let (len, pipeline) = (self.pipeline.background_len(), &mut self.pipeline);
         self.topics.send_background(header, len, |background| pipeline.write_background(background));
-    }
-}
-
-/// Stages of a scan's publication, in their order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Stage {
-    Scan,
-    Zones,
-    /// Marks, lines and motion.
-    Motion,
-    /// Foreground and background.
-    Background,
-}
-
-impl Stage {
-    /// Returns the last stage whose topics have a subscriber; `Scan` if none has one. The event is sent after it.
-    fn last_awaited<S: Platform>(topics: &Topics<'_, S>) -> Stage {
-        let Publishers { zones, marks, lines, motion, foreground, background, .. } = &topics.publishers;
-        if foreground.has_subscribers() || background.has_subscribers() {
-            Stage::Background
-        } else if marks.has_subscribers() || lines.has_subscribers() || motion.has_subscribers() {
-            Stage::Motion
-        } else if zones.has_subscribers() {
-            Stage::Zones
-        } else {
-            Stage::Scan
-        }
     }
 }
 

@@ -5,6 +5,8 @@
 //! possible subscribers. After a pause, none of this is in the processor's cache. The publisher therefore stores how
 //! many subscribers its topic had at the last [look](PreparedPublisher::look), and uses iceoryx2 only if it had any.
 
+use std::fmt::Debug;
+
 use scanhub_schema::limits::history;
 use scanhub_schema::{Failure, Header};
 use scanhub_shm::{DueRings, Medium, Payload, TopicPublisher};
@@ -94,7 +96,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     }
 
     /// Skips the number of a sample that is not sent, because the topic has no subscriber.
-    fn skip(&mut self) {
+    pub(crate) fn skip(&mut self) {
         self.topic.skip(1);
         self.reached = 0;
     }
@@ -123,7 +125,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// Connects new subscribers, and gives them the history of the topic.
     pub(crate) fn connect(&self) {
         if let Err(error) = self.topic.connect() {
-            tracing::debug!(?error, "a subscriber could not be connected");
+            log_unconnected(&error);
         }
     }
 
@@ -160,11 +162,15 @@ impl<P: Payload + ?Sized, M: Medium<P>> Loan<P, M> {
     }
 }
 
+#[cold]
+fn log_unconnected(error: &dyn Debug) {
+    tracing::debug!(?error, "a subscriber could not be connected");
+}
+
 #[cfg(test)]
 mod tests {
     use std::cell::Cell;
     use std::convert::Infallible;
-    use std::fmt::Debug;
     use std::rc::Rc;
 
     use scanhub_schema::Marks;

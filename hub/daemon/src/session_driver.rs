@@ -248,15 +248,11 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         let OpenLine { line, session, .. } = open;
         let platform = core.platform;
         let recorded = RecordedMetadata::default();
-        let (mut published, mut is_scan) = (false, !core.stats.is_streaming());
+        let (mut published, mut has_reply, mut is_scan) = (false, false, !core.stats.is_streaming());
         (open.waits_for_bytes, open.deadline) = loop {
             match session.poll_output() {
                 Output::SetRate(baud) => {
-                    // Setting the rate hides what another process has changed.
-                    restore(core, line, baud)?;
-                    if !self.set_baud(core, line, baud)? {
-                        session.reject_rate(platform.now());
-                    }
+                    self.change_rate(core, line, session, baud)?;
                     // Changing the rate discards buffered input.
                     open.backlog = None;
                     open.settings_check.pass();
@@ -278,6 +274,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                         self.note_silence(core, received.last, is_backlogged);
                         is_scan = true;
                     }
+                    has_reply |= received.is_reply;
                     if let Some(lifetime) = core.publish(&received, &recorded, is_backlogged) {
                         // On a tty, the time from a backlogged scan to the next one is unknown, so the next one never
                         // counts as consecutive. On a network port, its stamp decides.
@@ -304,11 +301,12 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
                 }
             }
         };
+        let now = platform.now();
         if published {
             self.line_errors.wait();
             open.settings_check.pass();
+            core.diagnosis.note_telegram(now);
         }
-        let now = platform.now();
         let is_altered =
             open.settings_check.is_due(session.state(), now) && restore(core, line, session.rate())?;
         if is_altered {
@@ -329,8 +327,9 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
             }
         }
         let is_streaming = session.state() == line::State::Streaming && core.stats.is_streaming();
-        // While telegrams arrive, only a telegram or another process changes what the status reports.
-        if published || is_altered || !is_streaming || core.is_due(now) {
+        // While scans arrive, only a reply or another process changes what the status reports. The few things that a
+        // scan can change are found as soon as the history is due.
+        if has_reply || is_altered || !is_streaming || core.is_due(now) || core.diagnosis.is_outdated() {
             self.report(core, open, now);
         }
         open.throttled_until =
@@ -339,6 +338,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     }
 
     /// Examines the session, and publishes and saves what has changed or is due.
+    #[inline(never)]
     fn report(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>, now: Nanos) {
         let platform = core.platform;
         let session = &mut open.session;
@@ -375,11 +375,22 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
         }
     }
 
-    /// Sets the rate. Returns whether the port accepts it. The search continues without a rate that the port rejects.
-    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
-        let error = line.set_baud(baud)?;
-        error.iter().for_each(|error| self.log_rejected_rate(core, baud, error));
-        Ok(error.is_none())
+    /// Sets the rate to `baud`. A search continues without a rate that the port rejects.
+    #[cold]
+    fn change_rate(
+        &mut self,
+        core: &mut LinkCore<'a, S>,
+        line: &S::Line,
+        session: &mut PortSession,
+        baud: u32,
+    ) -> io::Result<()> {
+        // Setting the rate hides what another process has changed.
+        restore(core, line, baud)?;
+        if let Some(error) = line.set_baud(baud)? {
+            self.log_rejected_rate(core, baud, &error);
+            session.reject_rate(core.platform.now());
+        }
+        Ok(())
     }
 
     /// Logs once why the port rejects this rate.
@@ -391,6 +402,7 @@ impl<'a, S: Platform> SessionDriver<'a, S> {
     }
 
     /// Saves the scanner that a search has found and that streams, and logs it once its model is known.
+    #[cold]
     fn note_scanner(&mut self, core: &LinkCore<'a, S>, session: &PortSession, now: Nanos) {
         let Some(memory) = session.memory() else { return };
         let (link, status) = (core.link, core.stats.last());
@@ -454,6 +466,7 @@ fn name_of(scanner: &KnownScanner) -> String {
 }
 
 /// Restores the hub's settings of `line`, at `baud`, if another process has changed them. Returns whether it has.
+#[cold]
 fn restore<S: Platform>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
     let Some(alteration) = line.altered()? else { return Ok(false) };
     line.restore(baud)?;

@@ -87,26 +87,26 @@ impl<'a> System<'a> {
             }
             let Wait { requests, on, until } = link.on_wakeup(woken);
             let until = if on_start.is_some() { until.min(start_by) } else { until };
+            let now = clock::now();
             let dial = self.dial.borrow();
             let port = match on {
                 WaitSource::Nothing => None,
                 WaitSource::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
                 WaitSource::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
-                WaitSource::Loss(_) if self.sleeps(until) => {
+                WaitSource::Loss(_) if self.sleeps(now, until) => {
                     woken = WakeReason::Timeout;
                     continue;
                 }
                 WaitSource::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
             };
-            woken = self.wait(requests, port, until);
+            woken = self.wait(requests, port, now, until);
         }
         link.end();
     }
 
-    /// Sleeps until `until` instead of polling, if that is soon and the last poll was a moment ago. Returns whether it
-    /// has. A poll of several descriptors, one of them a tty, costs more than the sleep.
-    fn sleeps(&self, until: Nanos) -> bool {
-        let now = clock::now();
+    /// Sleeps from `now` until `until` instead of polling, if that is soon and the last poll was a moment ago. Returns
+    /// whether it has. A poll of several descriptors, one of them a tty, costs more than the sleep.
+    fn sleeps(&self, now: Nanos, until: Nanos) -> bool {
         let is_soon = until <= now + MAX_SLEEP && now < self.polled_at.get() + MAX_POLL_INTERVAL;
         if is_soon {
             std::thread::sleep(Duration::from_nanos(until.saturating_sub(now)));
@@ -115,14 +115,14 @@ impl<'a> System<'a> {
         is_soon
     }
 
-    /// Waits for one of the events at the descriptor, a request, or the end of the hub, at most until `until`.
+    /// Waits from `now` for one of the events at the descriptor, a request, or the end of the hub, at most until `until`.
     fn wait(
         &self,
         requests: &ControlQueue,
         port: Option<(BorrowedFd<'_>, PollFlags)>,
+        now: Nanos,
         until: Nanos,
     ) -> WakeReason {
-        let now = clock::now();
         self.polled_at.set(now);
         let span = clock::span(now, until);
         let stop = self.hub.stop.as_fd();
@@ -159,7 +159,8 @@ impl<'a> LinkCore<'a, System<'a>> {
     pub(crate) fn wait(&mut self, event: BorrowedFd<'_>, until: Nanos) -> WakeReason {
         loop {
             let deadline = self.next_deadline(until, false);
-            let woken = self.platform.wait(&self.control, Some((event, PollFlags::IN)), deadline);
+            let port = Some((event, PollFlags::IN));
+            let woken = self.platform.wait(&self.control, port, clock::now(), deadline);
             if self.is_over(woken, until) {
                 return woken;
             }
@@ -271,7 +272,7 @@ impl Platform for System<'_> {
 
     fn notify_event(&self, why: Wake) {
         if let Some(Err(failure)) = self.name.get().map(|name| name.waker.tell(why)) {
-            tracing::debug!(%failure, "some consumers were not woken");
+            log_unnotified(&failure);
         }
     }
 
@@ -334,6 +335,11 @@ impl Line for Port {
     fn is_simulated(&self) -> bool {
         self.simulated()
     }
+}
+
+#[cold]
+fn log_unnotified(failure: &Failure) {
+    tracing::debug!(%failure, "some consumers were not woken");
 }
 
 /// Maximum wait that is slept through.

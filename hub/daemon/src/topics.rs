@@ -36,13 +36,6 @@ macro_rules! publishers {
                 $(self.$name.look();)*
             }
 
-            /// Prepares the topics that are published with every scan.
-            fn prepare(&mut self) {
-                $(if is_of_scan(Topic::$topic) {
-                    self.$name.prepare();
-                })*
-            }
-
             /// Gives new subscribers the history of the topics that have one.
             fn deliver_history(&self) {
                 $(if history(Topic::$topic) > 0 {
@@ -71,6 +64,59 @@ macro_rules! publishers {
 
 scanhub_schema::for_each_topic!(links: publishers);
 
+impl<S: Platform> Publishers<S> {
+    /// Prepares the topics that are published with every scan, up to stage `last`.
+    fn prepare(&mut self, last: Stage) {
+        self.telegram.prepare();
+        self.scan.prepare();
+        self.zones.prepare();
+        if last >= Stage::Results {
+            self.marks.prepare();
+            self.lines.prepare();
+            self.motion.prepare();
+            self.foreground.prepare();
+        }
+    }
+
+    /// Returns the last stage before the doorbell [`Ring::First`] whose topics had a subscriber at the last look;
+    /// `Telegram` if none had one.
+    fn first_awaited(&self) -> Stage {
+        if self.zones.has_subscribers() {
+            Stage::Zones
+        } else if self.scan.has_subscribers() {
+            Stage::Scan
+        } else {
+            Stage::Telegram
+        }
+    }
+
+    /// Returns the last stage whose topics had a subscriber at the last look; `Scan` if none had one.
+    fn last_awaited(&self) -> Stage {
+        if self.foreground.has_subscribers() || self.background.has_subscribers() {
+            Stage::Background
+        } else if self.marks.has_subscribers()
+            || self.lines.has_subscribers()
+            || self.motion.has_subscribers()
+        {
+            Stage::Results
+        } else {
+            self.first_awaited().max(Stage::Scan)
+        }
+    }
+}
+
+/// Stages of a scan's publication, in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Stage {
+    Telegram,
+    Scan,
+    Zones,
+    /// Marks, lines and motion.
+    Results,
+    /// Foreground and background.
+    Background,
+}
+
 /// Publisher of one topic.
 type Publisher<P, S> = PreparedPublisher<P, <S as Platform>::Medium<P>>;
 
@@ -91,6 +137,10 @@ pub(crate) struct Topics<'a, S: Platform> {
     attached: Option<u32>,
     /// Whether the event of the link had a listener at the last look.
     has_listeners: bool,
+    /// Stage after which [`Ring::First`] rings, as of the last look.
+    first_awaited: Stage,
+    /// Stage after which all doorbells ring and the event is sent, as of the last look.
+    last_awaited: Stage,
 }
 
 impl<'a, S: Platform> Topics<'a, S> {
@@ -112,6 +162,8 @@ impl<'a, S: Platform> Topics<'a, S> {
             next_seq: 0,
             attached: None,
             has_listeners: false,
+            first_awaited: Stage::Telegram,
+            last_awaited: Stage::Scan,
         })
     }
 
@@ -130,8 +182,9 @@ impl<'a, S: Platform> Topics<'a, S> {
         (self.header.wall_ns, self.header.flags, self.is_recorded) = (wall_ns, flags, true);
     }
 
-    /// Looks for subscribers if any may have attached since the last look. Called before samples are sent: a new
-    /// subscriber gets the next sample, and without one, this is one look at one word for all topics.
+    /// Looks for subscribers if any may have attached since the last look. Called when a header is made, before its
+    /// samples are loaned and sent: a new subscriber gets the next sample, and without one, this is one look at one word
+    /// for all topics.
     fn note_attached(&mut self) {
         let attached = self.platform.attached();
         if attached.is_none() || attached != self.attached {
@@ -146,13 +199,29 @@ impl<'a, S: Platform> Topics<'a, S> {
     pub(crate) fn look(&mut self) {
         self.publishers.look();
         self.has_listeners = self.platform.has_listeners();
+        self.first_awaited = self.publishers.first_awaited();
+        self.last_awaited = self.publishers.last_awaited();
     }
 
     /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of its
     /// scan. Connects new subscribers now instead of while the telegram waits.
     pub(crate) fn prepare(&mut self) {
         self.note_attached();
-        self.publishers.prepare();
+        self.publishers.prepare(self.last_awaited);
+    }
+
+    /// Returns whether a topic of `stage` or of a later one had a subscriber at the last look.
+    pub(crate) fn awaits(&self, stage: Stage) -> bool {
+        self.last_awaited >= stage
+    }
+
+    /// Wakes the subscribers that wait for no later stage than `stage`, whose samples were sent.
+    pub(crate) fn end_stage(&mut self, stage: Stage) {
+        if stage == self.last_awaited {
+            self.wake(Wake::Telegram);
+        } else if stage == self.first_awaited {
+            self.ring(Ring::First);
+        }
     }
 
     /// Publishes a telegram, or packets, whose period is 0. Later samples have its number and its stamps, until the next
@@ -214,7 +283,6 @@ impl<'a, S: Platform> Topics<'a, S> {
         reasons: u8,
         period_us: u32,
     ) {
-        self.note_attached();
         let now = self.platform.now();
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         let mut header = Header {
@@ -225,8 +293,7 @@ impl<'a, S: Platform> Topics<'a, S> {
             quality: quality as u8,
             reasons,
             period_us,
-            flags: self.header.flags & !Flags::STAMP_ESTIMATED,
-            ..self.header
+            ..self.header_at(now)
         };
         header.set_sent_at(now);
         let mut early = self.publishers.early.loan(0);
@@ -242,10 +309,9 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Sends zones as of `now`, without a scan. `write` writes them, even if there is no memory for the sample.
     pub(crate) fn send_zones(&mut self, now: u64, write: impl FnOnce(&mut Zones)) {
-        self.note_attached();
+        let header = self.header_at(now);
         let mut zones = self.publishers.zones.loan(0);
         write(zones.payload_mut().unwrap_or(&mut Zones::default()));
-        let header = self.header_at(now);
         self.publishers.zones.send(zones, &header, &mut self.due);
     }
 
@@ -256,7 +322,6 @@ impl<'a, S: Platform> Topics<'a, S> {
         len: usize,
         write: impl FnOnce(&mut Background),
     ) {
-        self.note_attached();
         let mut background = self.publishers.background.loan(len);
         match background.payload_mut() {
             Some(payload) => write(payload),
@@ -267,12 +332,11 @@ impl<'a, S: Platform> Topics<'a, S> {
 
     /// Publishes the status as of `now`.
     pub(crate) fn status(&mut self, status: &Status, now: u64) {
-        self.note_attached();
+        let header = self.header_at(now);
         let mut sample = self.publishers.status.loan(0);
         if let Some(payload) = sample.payload_mut() {
             *payload = *status;
         }
-        let header = self.header_at(now);
         self.publishers.status.send(sample, &header, &mut self.due);
     }
 
@@ -299,14 +363,11 @@ impl<'a, S: Platform> Topics<'a, S> {
         }
     }
 
-    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise. Returns
-    /// whether it did.
-    pub(crate) fn ring(&mut self, ring: Ring) -> bool {
-        let is_due = self.due.take(ring);
-        if is_due {
+    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
+    fn ring(&mut self, ring: Ring) {
+        if self.due.take(ring) {
             self.platform.ring(ring);
         }
-        is_due
     }
 
     /// Returns whether a sample was sent whose doorbell has not rung yet.
@@ -354,8 +415,10 @@ impl<'a, S: Platform> Topics<'a, S> {
         })
     }
 
-    /// Returns the header of a sample that is published at `now` without a telegram.
-    pub(crate) fn header_at(&self, now: u64) -> Header {
+    /// Returns the header of a sample that is published at `now` without a telegram. Called before its loan is taken,
+    /// because it looks for new subscribers.
+    pub(crate) fn header_at(&mut self, now: u64) -> Header {
+        self.note_attached();
         let wall_ns = if self.is_recorded {
             self.header.wall_ns
         } else {
@@ -363,11 +426,6 @@ impl<'a, S: Platform> Topics<'a, S> {
         };
         header_without_telegram(&self.header, now, wall_ns)
     }
-}
-
-/// Returns whether `topic` is published with every scan.
-const fn is_of_scan(topic: Topic) -> bool {
-    matches!(topic.row().pace, Pace::Scan)
 }
 
 /// The stamps of the last telegram or revolution. On a busy machine, several telegrams may be read at once, so that their

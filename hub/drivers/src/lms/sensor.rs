@@ -220,7 +220,7 @@ impl Sensor {
         self.set_kind(&known.kind[..kind_len]);
     }
 
-    /// Stores the type `kind`, of which the first [`KIND_LEN`] bytes count.
+    /// Stores the first [`KIND_LEN`] bytes of the type `kind`.
     fn set_kind(&mut self, kind: &[u8]) {
         self.kind_len = kind.len().min(KIND_LEN);
         self.kind = [0; KIND_LEN];
