@@ -3,9 +3,11 @@
 //! hardly depend on the machine's load, unlike those of `hub_load`. The bench does not measure time.
 //!
 //! The sensor sends at 9,600 baud, so that the steps keep up. Two costs would therefore be too high and are left out:
-//! repeated waits ([`steps::Cost`]), and the status, which is published once a second and thus with every other
-//! telegram. Its stage is still shown. Without symbols, all figures contain the status. The steps delay the hub, so it
-//! sleeps and reads less often than usual. System calls are therefore also counted at 500,000 baud, without steps.
+//! repeated waits ([`steps::Cost`]), and what the hub does at most ten times a second, which is with every telegram at
+//! this rate, but with one of four at 500,000 baud. It examines the session and searches for subscribers, and once a
+//! second it publishes the status. The stage of the status is still shown. Without symbols, all figures contain it. The
+//! steps delay the hub, so it sleeps and reads less often than usual. System calls are therefore also counted at 500,000
+//! baud, without steps.
 //!
 //! The background is measured while it is being learned, and after it was. Another hub learns it at 500,000 baud, and
 //! the measured one starts with the saved model.
@@ -15,6 +17,9 @@
 //! ```text
 //! CARGO_PROFILE_BENCH_STRIP=none CARGO_PROFILE_RELEASE_STRIP=none cargo bench --bench path
 //! ```
+//!
+//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.ld`. Entries for
+//! functions that no longer exist do no harm, so write it again only if the path has changed much.
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
 
 #[cfg(target_arch = "x86_64")]
@@ -42,7 +47,7 @@ use on_x86_64::measure;
 
 #[cfg(target_arch = "x86_64")]
 mod on_x86_64 {
-    use std::collections::{BTreeMap, HashMap};
+    use std::collections::{BTreeMap, HashMap, HashSet};
     use std::fs;
     use std::path::{Path, PathBuf};
     use std::process::Stdio;
@@ -57,7 +62,7 @@ mod on_x86_64 {
 
     pub(crate) fn measure(options: &Options) -> Outcome<()> {
         let count = options.count(if options.quick { 10 } else { 100 });
-        let mut cells = Vec::new();
+        let (mut cells, mut order) = (Vec::new(), [Vec::new(), Vec::new()]);
         for background in ["learned", "not learned"] {
             let stage = Stage::new()?;
             let flags = ["--baud", "500000", "--state", "streaming", "--lossless"];
@@ -89,9 +94,23 @@ mod on_x86_64 {
             let (profile, calls) = step(&mut stepper, &code, count, end)?;
             stepper.detach();
             show(background, &profile, &calls, code.has_names(), &mut cells);
+            for (patterns, of_status) in order.iter_mut().zip([false, true]) {
+                patterns.extend(profile.patterns(of_status));
+            }
+        }
+        if std::env::var_os("SCANHUB_WRITE").is_some() {
+            fs::write(LINK_ORDER, link_order(&order.concat()))?;
         }
         figures::print_cells("path", options.json, &cells);
         Ok(())
+    }
+
+    /// Returns a linker script that puts functions next to each other, in the order of `patterns` for their symbols.
+    fn link_order(patterns: &[String]) -> String {
+        let mut known = HashSet::new();
+        let patterns = patterns.iter().filter(|pattern| known.insert(*pattern));
+        let lines: String = patterns.map(|pattern| format!("    *(.text.{pattern})\n")).collect();
+        format!("{ABOUT}SECTIONS\n{{\n  .text.path :\n  {{\n{lines}  }}\n}}\nINSERT BEFORE .text;\n")
     }
 
     /// Starts a hub at 500,000 baud that learns the background and saves it. Then counts its system calls for `count`
@@ -259,6 +278,10 @@ mod on_x86_64 {
     }
 
     const SENSOR: &str = "front";
+    /// The linker script that `build.rs` passes to the linker, and its first lines.
+    const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.ld");
+    const ABOUT: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
+        status. Written by the bench `path`. */\n";
     /// Time between two telegrams at 9,600 baud.
     const INTERVAL: Duration = Duration::from_millis(773);
     /// Limit for the steps of one state of the background, in seconds. An idle machine needs less for 100 telegrams.

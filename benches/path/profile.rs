@@ -7,6 +7,9 @@ use std::process::Command;
 
 /// The code of a process, with names.
 pub(crate) struct Code {
+    /// Path of the program, and address of its first page.
+    program: String,
+    base: u64,
     /// Mapped files, by address: start, end and name.
     files: Vec<(u64, u64, String)>,
     /// Address in memory and name of each function of the program, by address. Empty if the program has no symbols.
@@ -32,7 +35,8 @@ impl Code {
             files.push((start, end, if path == program { String::new() } else { name.to_owned() }));
         }
         let base = base.ok_or("the program is not in its own memory map")?;
-        Ok(Code { files, functions: functions(&program, base) })
+        let functions = functions(&program, base, &["-C"]);
+        Ok(Code { program, base, files, functions })
     }
 
     /// Returns whether functions have names.
@@ -62,9 +66,9 @@ impl Code {
     }
 }
 
-/// Returns address and name of the functions of `program`, whose first page is at `base`.
-fn functions(program: &str, base: u64) -> Vec<(u64, String)> {
-    let Ok(output) = Command::new("nm").args(["-C", "--defined-only", program]).output() else {
+/// Returns address and name of the functions of `program`, whose first page is at `base`, by `nm` with `flags`.
+fn functions(program: &str, base: u64, flags: &[&str]) -> Vec<(u64, String)> {
+    let Ok(output) = Command::new("nm").args(flags).args(["--defined-only", program]).output() else {
         return Vec::new();
     };
     let mut functions: Vec<_> = String::from_utf8_lossy(&output.stdout)
@@ -78,6 +82,12 @@ fn functions(program: &str, base: u64) -> Vec<(u64, String)> {
         .collect();
     functions.sort();
     functions
+}
+
+/// Returns the pattern for the linker that matches `symbol` without its hash.
+fn pattern(symbol: &str) -> String {
+    let symbol = symbol.rsplit_once("17h").map_or(symbol.to_owned(), |(path, _)| format!("{path}17h*"));
+    symbol.replace('$', "?")
 }
 
 /// Returns the crate of the function `name`: the first component of its path, which for a generic function is that of
@@ -98,7 +108,7 @@ pub(crate) enum Stage {
     Publish,
     Processors,
     Bookkeeping,
-    /// The status, which the hub publishes once a second.
+    /// The status, which the hub publishes once a second, and what it checks up to ten times a second.
     Status,
     Other,
 }
@@ -143,7 +153,8 @@ const STAGES: [(&str, Stage); 34] = [
 ];
 
 /// Ends of the names of functions in which everything belongs to the status. With it, the hub saves the scanner's identity.
-const STATUS: [&str; 5] = [
+const STATUS: [&str; 6] = [
+    "SessionDriver<S>::report",
     "LinkCore<S>::show",
     "LinkCore<S>::show_session",
     "LinkCore<S>::publish_status",
@@ -162,7 +173,7 @@ impl Stage {
             Stage::Publish => "publish and doorbell",
             Stage::Processors => "background, other processors",
             Stage::Bookkeeping => "bookkeeping",
-            Stage::Status => "status, once a second",
+            Stage::Status => "status, checks ten times a second",
             Stage::Other => "other",
         }
     }
@@ -211,6 +222,8 @@ pub(crate) struct Profile<'a> {
     pub(crate) by_function: HashMap<&'a str, Sum>,
     /// Sums of each telegram, without the status.
     pub(crate) each: Vec<Sum>,
+    /// Addresses of functions in the order of their first steps: for the path, and for the status.
+    order: [Vec<u64>; 2],
 }
 
 impl<'a> Profile<'a> {
@@ -223,7 +236,21 @@ impl<'a> Profile<'a> {
             by_crate: HashMap::new(),
             by_function: HashMap::new(),
             each: Vec::new(),
+            order: Default::default(),
         }
+    }
+
+    /// Returns patterns for the symbols of the functions that were stepped through, in their order: those of the path, or
+    /// those `of_status`. The patterns leave out the hash at the end of a symbol, and with it the types of a generic
+    /// function.
+    pub(crate) fn patterns(&self, of_status: bool) -> Vec<String> {
+        let symbols = functions(&self.code.program, self.code.base, &[]);
+        let of_address = |address| {
+            let begin = symbols.partition_point(|(start, _)| *start < address);
+            symbols[begin..].iter().take_while(move |(start, _)| *start == address)
+        };
+        let order = &self.order[usize::from(of_status)];
+        order.iter().flat_map(|address| of_address(*address)).map(|(_, symbol)| pattern(symbol)).collect()
     }
 
     /// Returns the stage of an instruction at `address` in the functions `calls`, outermost first.
@@ -251,6 +278,13 @@ impl<'a> Profile<'a> {
         let (mut by_crate, mut by_function) = (HashMap::<&str, Steps>::new(), HashMap::<&str, Steps>::new());
         for (address, stage) in steps {
             by_stage.entry(stage).or_default().add(address);
+            if let Some((index, _)) = self.code.function(address) {
+                let order = &mut self.order[usize::from(stage == Stage::Status)];
+                let function = self.code.functions[index].0;
+                if !order.contains(&function) {
+                    order.push(function);
+                }
+            }
             if stage == Stage::Status {
                 continue;
             }
