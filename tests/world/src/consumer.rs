@@ -89,7 +89,7 @@ impl Consumer {
         })
     }
 
-    /// The hub rang `bell` of its sensor at `at`.
+    /// Wakes the subscriber if it sleeps on `bell`, which the hub rang at `at`.
     pub(crate) fn wake(&mut self, bell: Bell, at: Nanos) {
         let awaited = match self.habit {
             Habit::Listener => Bell::Event,
@@ -100,7 +100,7 @@ impl Consumer {
         }
     }
 
-    /// It looks for samples at `at`, unless it does so at times of its own.
+    /// Makes the subscriber poll for samples at `at`, unless it polls at fixed intervals.
     pub(crate) fn look_at(&mut self, at: Nanos) {
         if !matches!(self.habit, Habit::Slow { .. }) {
             self.next_at = self.next_at.min(at + TAKES);

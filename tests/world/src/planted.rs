@@ -91,7 +91,7 @@ pub enum Defect {
     NeedlessByte,
     /// The hub is not told that a subscriber has attached.
     UnseenSubscriber,
-    /// Now and then the hub rings for nobody.
+    /// Now and then the hub rings although no subscriber has a new sample.
     NeedlessRing,
     /// Now and then the event is not sent.
     UnsentEvent,

@@ -38,13 +38,13 @@ pub(crate) struct Shared {
     pub(crate) handles: Cell<usize>,
     /// Nobody can open anything.
     pub(crate) lacks_descriptors: Cell<bool>,
-    /// Sensors whose consumers were woken, by what, and when.
+    /// Sensors whose subscribers were woken, the bell, and the time.
     pub(crate) woken: RefCell<Vec<(usize, Bell, Nanos)>>,
-    /// Number of the next consumer.
+    /// Number of the next subscriber.
     pub(crate) next_consumer: Cell<u32>,
     /// Changes of subscribers that happen while a hub sends the samples of a scan.
     pub(crate) changes: RefCell<Vec<Change>>,
-    /// Consumers that have come by such a change, with the milliseconds for which they stay, and those that have left.
+    /// Subscribers that such a change has attached, with the milliseconds for which they stay, and those that have left.
     pub(crate) newcomers: RefCell<Vec<(Consumer, u64)>>,
     pub(crate) leavers: RefCell<Vec<Number>>,
 }
@@ -57,10 +57,10 @@ pub(crate) struct Change {
     pub(crate) what: Who,
 }
 
-/// Consumer that comes or leaves.
+/// Subscriber that attaches or leaves.
 #[derive(Clone, Copy)]
 pub(crate) enum Who {
-    /// A new one comes, and stays for this number of milliseconds.
+    /// A new one attaches, and stays for this number of milliseconds.
     Comes { topic: Topic, habit: Habit, holds: usize, span_ms: u64 },
     /// This subscriber of a topic leaves.
     Leaves { topic: Topic, number: Number },
@@ -71,14 +71,14 @@ impl Shared {
         self.log.tell(self.clock.get(), event);
     }
 
-    /// Returns the number of a new consumer.
+    /// Returns the number of a new subscriber.
     pub(crate) fn consumer_number(&self) -> Number {
         let number = self.next_consumer.get();
         self.next_consumer.set(number + 1);
         Number(number)
     }
 
-    /// A sample of `sensor` was sent at `now`: lets those changes of subscribers happen that are due.
+    /// Makes the changes of subscribers that are due after a sample of `sensor` was sent at `now`.
     pub(crate) fn change_subscribers(&self, sensor: usize, now: Nanos) {
         let mut due = Vec::new();
         self.changes.borrow_mut().retain_mut(|change| {

@@ -73,7 +73,7 @@ struct Place {
     consumer: Number,
     queue: VecDeque<Rc<Sample>>,
     is_connected: bool,
-    /// It sleeps on the event of the sensor.
+    /// Whether the subscriber sleeps on the event of the sensor.
     is_listener: bool,
     /// Its process was killed; the next hub cleans up.
     is_dead: bool,
@@ -124,7 +124,7 @@ impl Board {
         self.sensors[sensor].iter().flat_map(|channel| &channel.places).any(|place| place.is_listener)
     }
 
-    /// A place for `consumer`, if there is one. An `is_listener` sleeps on the event of the sensor.
+    /// Attaches `consumer`, which sleeps on the event of the sensor if it `is_listener`. Returns whether there was a place.
     pub(crate) fn attach(
         &mut self,
         sensor: usize,

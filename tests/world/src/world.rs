@@ -215,7 +215,7 @@ impl World {
         }
     }
 
-    /// Takes over the consumers that came and left while samples were sent.
+    /// Takes over the subscribers that attached and left while samples were sent.
     fn admit_newcomers(&mut self) {
         let shared = self.shared.clone();
         let leavers = shared.leavers.take();
@@ -349,7 +349,7 @@ impl World {
 
 /// The wall clock when a world begins: some day in 2026.
 const WALL_NS: u64 = 1_780_000_000_000_000_000;
-/// More than the samples of one scan: a consumer leaves after fewer.
+/// More than the samples of one scan. A subscriber leaves after fewer.
 const MOST_SENDS: u64 = 12;
 /// A consumer without a hub looks for one so often.
 const LOOKS: Nanos = 50 * MILLIS;

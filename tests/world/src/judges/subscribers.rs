@@ -1,4 +1,4 @@
-//! Judge of subscribers that come and leave at any time: each gets the next sample, and none is woken late or for nothing.
+//! Judge of subscribers that attach and leave at any time: each gets the next sample, and none is woken late or needlessly.
 
 use std::collections::BTreeMap;
 
@@ -23,7 +23,7 @@ struct OfSensor {
     /// Number of the last telegram, and of the last scan, of this hub.
     last: Option<u64>,
     scan: Option<u64>,
-    /// For each topic, the number of the last scan of which it had a sample.
+    /// For each topic, the number in its last sample.
     published: BTreeMap<Topic, u64>,
     /// Topics that had no memory since the last scan.
     lacking: Vec<Topic>,
@@ -38,7 +38,7 @@ struct OfSensor {
 struct Attached {
     topic: Topic,
     is_listener: bool,
-    /// The last telegram before it came.
+    /// The last telegram before the subscriber attached.
     after: Option<u64>,
 }
 
