@@ -85,9 +85,9 @@ impl Discovery {
         self.hub.is_some()
     }
 
-    /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time. No
-    /// call is necessary while the services of the domain are the same as at the last answer: it executes a million
-    /// instructions for each of them, which is half of what a gateway executes.
+    /// Starts to list the sensors of the hub in `domain` if a list is due. Returns the last list, once, when it is complete.
+    /// While the services of the domain stay as they were at the last list, there is no new one. A list executes a million
+    /// instructions for each service, half of what a gateway executes.
     ///
     /// [`Kind::Failed`](scanhub_schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
     pub fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
@@ -126,8 +126,8 @@ impl Discovery {
     }
 }
 
-/// Returns the time of the last change of the services of `domain`. `None` if it is unknown, or so recent that a service
-/// may still be incomplete, which a call does not find.
+/// Returns the time at which a service of `domain` was last created or removed. `None` if the time is unknown, or so
+/// recent that a service may still be incomplete, which a list does not include.
 fn last_change(domain: &Domain) -> Option<SystemTime> {
     let changed = std::fs::metadata(domain.root().join(SERVICES)).ok()?.modified().ok()?;
     changed.elapsed().is_ok_and(|age| age >= COMPLETE).then_some(changed)
