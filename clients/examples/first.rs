@@ -8,7 +8,8 @@ fn main() -> Result<(), Error> {
     let mut scans = Subscriber::<Scan>::builder("front").timeout(Duration::from_millis(500)).open()?;
     loop {
         let Some(scan) = scans.next()? else {
-            println!("no scan for half a second; there is a hub: {}", scans.hub_is_running());
+            let reason = scans.why_silent();
+            println!("no scan for {:.1?}: {reason}; {}", scans.silent_for(), reason.remedy());
             continue;
         };
         if scan.missed > 0 || scan.restarted {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use scanhub_schema::{Flags, Header, Kind, Scan};
 use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
 
-use crate::error::Error;
+use crate::error::{Error, ErrorKind};
 use crate::session::Session;
 
 /// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four samples of a
@@ -49,6 +49,8 @@ pub struct Follower<P: Payload + ?Sized> {
     sensor: String,
     port: Option<(u32, Subscriber<P, ThreadSafeService>)>,
     asked_at: Option<Instant>,
+    /// Reason why the last attempt to subscribe found no place, memory or descriptor.
+    refused: Option<Error>,
     numbers: Numbers,
     unconnected_since: Option<Instant>,
     /// Moment of the session in which no sample had arrived.
@@ -68,6 +70,7 @@ impl<P: Payload + ?Sized> Follower<P> {
             sensor: sensor.to_owned(),
             port: None,
             asked_at: None,
+            refused: None,
             numbers: Numbers::default(),
             unconnected_since: None,
             nothing_at: None,
@@ -79,6 +82,20 @@ impl<P: Payload + ?Sized> Follower<P> {
         self.port.is_some()
     }
 
+    pub(crate) fn sensor(&self) -> &str {
+        &self.sensor
+    }
+
+    /// Returns whether it is subscribed to the topic of the session's present hub.
+    pub(crate) fn is_attached(&self, session: &Session) -> bool {
+        self.port.as_ref().is_some_and(|(number, _)| *number == session.number())
+    }
+
+    /// Returns the reason why the last attempt to subscribe found no place, memory or descriptor.
+    pub(crate) fn refused(&self) -> Option<&Error> {
+        self.refused.as_ref()
+    }
+
     /// Returns the next sample that has arrived.
     ///
     /// # Errors
@@ -87,6 +104,15 @@ impl<P: Payload + ?Sized> Follower<P> {
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors or memory are short,
     /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic has another layout.
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
+        let received = self.receive_quietly(session)?;
+        if received.is_some() {
+            session.heard();
+        }
+        Ok(received)
+    }
+
+    /// Returns the next sample that has arrived, and does not end a silence of the session by it.
+    pub(crate) fn receive_quietly(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
         if !self.subscribe(session)? {
             return Ok(None);
         }
@@ -101,9 +127,6 @@ impl<P: Payload + ?Sized> Follower<P> {
             Ok(sample) => {
                 self.unconnected_since = None;
                 self.nothing_at = moment.filter(|_| sample.is_none());
-                if sample.is_some() {
-                    session.heard();
-                }
                 Ok(sample.map(|sample| self.account(sample)))
             }
             Err(ReceiveError::ExceedsMaxBorrows) => Err(Error::TooManyHeld),
@@ -120,14 +143,19 @@ impl<P: Payload + ?Sized> Follower<P> {
     }
 
     fn subscribe(&mut self, session: &mut Session) -> Result<bool, Error> {
-        if self.port.as_ref().is_some_and(|(number, _)| *number == session.number()) {
+        if self.is_attached(session) {
             return Ok(true);
         }
         if self.asked_at.is_some_and(|at| at.elapsed() < ASK_EVERY) {
             return Ok(false);
         }
         self.asked_at = Some(Instant::now());
-        let Some(subscriber) = session.subscribe::<P>(&self.sensor)? else {
+        let subscriber = session.subscribe::<P>(&self.sensor);
+        self.refused = match &subscriber {
+            Err(error) if error.kind() == ErrorKind::ResourceExhausted => Some(error.clone()),
+            _ => None,
+        };
+        let Some(subscriber) = subscriber? else {
             return Ok(false);
         };
         self.port = Some((session.number(), subscriber));

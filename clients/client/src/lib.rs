@@ -43,6 +43,7 @@ mod publish;
 mod robot;
 mod sample;
 mod session;
+mod silence;
 #[cfg(feature = "tokio")]
 mod stream;
 mod subscribe;
@@ -57,6 +58,7 @@ pub use pollable::{Pollable, PollableSubscriber};
 pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};
 pub use robot::{Robot, RobotSubscriber, robot};
+pub use silence::Silence;
 pub use subscribe::{Iter, Subscriber, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesSubscriber, zones};

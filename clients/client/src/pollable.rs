@@ -9,6 +9,7 @@ use scanhub_shm::Payload;
 use crate::error::Error;
 use crate::follower::Received;
 use crate::robot::{Robot, RobotSubscriber};
+use crate::silence::Silence;
 #[cfg(feature = "tokio")]
 use crate::stream::Registration;
 use crate::subscribe::Subscriber;
@@ -112,6 +113,11 @@ impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
         self.locked().hub_is_running()
     }
 
+    /// As [`Subscriber::why_silent`].
+    pub fn why_silent(&self) -> Silence {
+        self.locked().why_silent()
+    }
+
     /// As [`Subscriber::silent_for`].
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
@@ -132,6 +138,11 @@ impl Pollable<ZonesSubscriber> {
     /// As [`ZonesSubscriber::hub_is_running`].
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
+    }
+
+    /// As [`ZonesSubscriber::why_silent`].
+    pub fn why_silent(&self) -> Silence {
+        self.locked().why_silent()
     }
 
     /// As [`ZonesSubscriber::silent_for`].

@@ -8,6 +8,7 @@ use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Domain, Environment, RunningHub, holder, publisher};
 
 use crate::error::Error;
+use crate::silence::Silence;
 
 /// Interval of the queries of the locks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
@@ -147,6 +148,21 @@ impl Presence {
     /// directory that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
     pub(crate) fn no_hub_here(&self) -> Failure {
         self.no_hub_beside(Vec::new)
+    }
+
+    /// Returns why there is no hub, for a subscriber that waits for one. It reads /proc: a few milliseconds.
+    pub(crate) fn absence(&self) -> Silence {
+        let hubs = RunningHub::all(Path::new("/"));
+        let (uid, name) = (Environment::of_process().uid, self.places.first().map(Domain::name));
+        // The domain of another user's hub may be unknown.
+        let may_be_it = |hub: &RunningHub| hub.domain.is_none() || hub.domain.as_deref() == name;
+        let is_of_other = self.denied.is_some() || hubs.iter().any(|hub| hub.uid != uid && may_be_it(hub));
+        let Failure { kind, message, hint: remedy } = self.no_hub_beside(|| hubs);
+        match kind {
+            Kind::Short => Silence::Full { message, remedy },
+            _ if is_of_other => Silence::OtherUser { message, remedy },
+            _ => Silence::NoHub { message, remedy },
+        }
     }
 
     fn no_hub_beside(&self, hubs: impl FnOnce() -> Vec<RunningHub>) -> Failure {

@@ -18,6 +18,7 @@ use crate::clock;
 use crate::error::Error;
 use crate::hub_monitor::HubMonitor;
 use crate::presence::{Change, Presence, Who};
+use crate::silence::Silence;
 use crate::wait::{Wait, Wakeups};
 
 /// Maximum wait. After it, the session looks for the hub, and the caller can stop.
@@ -155,6 +156,11 @@ impl Session {
     /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
     pub fn no_hub_here(&self) -> Error {
         self.presence.no_hub_here().into()
+    }
+
+    /// Returns why no hub runs, as of the last look.
+    pub(crate) fn absence(&self) -> Silence {
+        self.presence.absence()
     }
 
     /// Counts the domains joined: ports of an earlier one must be opened again.

@@ -9,6 +9,7 @@ use crate::builder::SubscriberBuilder;
 use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::session::Session;
+use crate::silence::{Silence, SilenceCheck};
 
 /// Subscribes to the topic of `sensor` that carries `P` ([`Telegram`](crate::Telegram), [`Scan`](crate::Scan),
 /// [`Marks`](crate::Marks) ..), in the domain that SCANHUB_DOMAIN names. The hub may start later. To act on zones, use
@@ -40,6 +41,7 @@ pub struct Subscriber<P: Payload + ?Sized> {
     session: Session,
     follower: Follower<P>,
     timeout: Option<Duration>,
+    silence: SilenceCheck,
 }
 
 impl<P: Payload + ?Sized> Subscriber<P> {
@@ -49,7 +51,7 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     }
 
     pub(crate) fn new(session: Session, sensor: &str, timeout: Option<Duration>) -> Subscriber<P> {
-        Subscriber { session, follower: Follower::new(sensor), timeout }
+        Subscriber { session, follower: Follower::new(sensor), timeout, silence: SilenceCheck::default() }
     }
 
     /// Waits for the next sample; `None` only after the timeout. Up to four samples may be held while others are received.
@@ -139,7 +141,42 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         self.session.silent_for()
     }
 
+    /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
+    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::time::Duration;
+    ///
+    /// use scanhub_client::{Error, Scan, Subscriber};
+    ///
+    /// fn main() -> Result<(), Error> {
+    ///     let mut scans = Subscriber::<Scan>::builder("front").timeout(Duration::from_secs(1)).open()?;
+    ///     loop {
+    ///         match scans.next()? {
+    ///             Some(scan) => println!("{} beams", scan.beams()),
+    ///             None => {
+    ///                 let reason = scans.why_silent();
+    ///                 println!("{reason}; {}", reason.remedy());
+    ///             }
+    ///         }
+    ///     }
+    /// }
+    /// ```
+    pub fn why_silent(&mut self) -> Silence {
+        self.silence.reason(&mut self.session, &self.follower)
+    }
+
     fn look(&mut self) -> Result<Option<Received<P>>, Error> {
+        let received = self.receive()?;
+        if received.is_some() {
+            self.silence.end();
+        }
+        Ok(received)
+    }
+
+    fn receive(&mut self) -> Result<Option<Received<P>>, Error> {
         // Samples that have arrived come first, because the look for the hub takes longer than receiving.
         if self.follower.subscribed()
             && let Some(received) = self.follower.receive(&mut self.session)?

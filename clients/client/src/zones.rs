@@ -11,6 +11,7 @@ use crate::clock::{self, Moment};
 use crate::error::Error;
 use crate::follower::Follower;
 use crate::session::Session;
+use crate::silence::{Silence, SilenceCheck};
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -63,6 +64,7 @@ impl Heard {
 pub struct ZonesSubscriber {
     session: Session,
     source: ZonesSource,
+    silence: SilenceCheck,
 }
 
 impl ZonesSubscriber {
@@ -72,7 +74,7 @@ impl ZonesSubscriber {
     }
 
     pub(crate) fn new(session: Session, sensor: &str) -> ZonesSubscriber {
-        ZonesSubscriber { session, source: ZonesSource::new(sensor) }
+        ZonesSubscriber { session, source: ZonesSource::new(sensor), silence: SilenceCheck::default() }
     }
 
     /// Waits for news: the newest sample, or one `unknown` per silence. That is returned two scan periods and 40 ms
@@ -111,6 +113,11 @@ impl ZonesSubscriber {
     /// machine was suspended counts (CLOCK_BOOTTIME).
     pub fn silent_for(&self) -> Duration {
         self.session.silent_for()
+    }
+
+    /// Returns why no zones arrive, as [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
+    pub fn why_silent(&mut self) -> Silence {
+        self.silence.reason(&mut self.session, &self.source.follower)
     }
 
     /// Returns the news, if there are any since the last call; never waits.

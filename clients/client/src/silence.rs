@@ -1,0 +1,240 @@
+//! Reasons why a subscriber receives no samples, with remedies.
+
+use std::fmt;
+
+use scanhub_schema::{Maker, Printable, State, Status, Topic};
+use scanhub_shm::Payload;
+
+use crate::error::Error;
+use crate::follower::Follower;
+use crate::session::Session;
+
+/// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user can
+/// do about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Silence {
+    /// No hub runs in the domain.
+    #[non_exhaustive]
+    NoHub {
+        /// The domain, and the reason if its directory cannot be opened.
+        message: String,
+        /// The command that starts a hub, and the hubs in other domains.
+        remedy: String,
+    },
+    /// Only another user runs a hub in the domain.
+    #[non_exhaustive]
+    OtherUser {
+        /// The domain, and the reason if its directory cannot be opened.
+        message: String,
+        /// The user, and ways to the data.
+        remedy: String,
+    },
+    /// The hub has no such sensor.
+    #[non_exhaustive]
+    UnknownSensor {
+        /// Name of the sensor to which the program has subscribed.
+        sensor: String,
+        /// Names of the sensors that exist.
+        sensors: Vec<String>,
+    },
+    /// The hub has the sensor, but does not publish the topic.
+    #[non_exhaustive]
+    UnknownTopic {
+        /// The sensor and the topic, as `front/marks`.
+        topic: String,
+        /// Names of the topics of the sensor.
+        topics: Vec<String>,
+    },
+    /// The scanner sends no data.
+    #[non_exhaustive]
+    Absent {
+        /// Name of the sensor.
+        sensor: String,
+        /// State of its link, other than [`State::Paused`] and [`State::Streaming`].
+        state: State,
+        /// Last error of the link; may be empty.
+        error: String,
+    },
+    /// The link is paused on request.
+    #[non_exhaustive]
+    Paused {
+        /// Name of the sensor.
+        sensor: String,
+    },
+    /// No place, memory or descriptor was left for the subscriber.
+    #[non_exhaustive]
+    Full {
+        /// What has run out.
+        message: String,
+        /// Ways to get a place.
+        remedy: String,
+    },
+    /// Nothing is wrong as far as the library knows: the next sample has not been sent yet, the hub is starting, or its
+    /// status has not arrived yet.
+    Waiting,
+}
+
+impl Silence {
+    /// Returns the reason that the status of a sensor shows.
+    pub(crate) fn of_status(sensor: &str, status: &Status) -> Silence {
+        let sensor = sensor.to_owned();
+        match status.state() {
+            None | Some(State::Streaming) => Silence::Waiting,
+            Some(State::Paused) => Silence::Paused { sensor },
+            Some(state) => {
+                let error = Printable(status.last_error()).to_string();
+                Silence::Absent { sensor, state, error }
+            }
+        }
+    }
+
+    /// Returns the reason for a topic that does not exist, if `published` is everything that the hub publishes. `None`
+    /// if the topic exists.
+    pub(crate) fn of_topics(sensor: &str, topic: Topic, published: &[(String, Topic)]) -> Option<Silence> {
+        let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
+        sensors.sort();
+        sensors.dedup();
+        if !sensors.iter().any(|known| known == sensor) {
+            return Some(Silence::UnknownSensor { sensor: sensor.to_owned(), sensors });
+        }
+        let of_sensor = published.iter().filter(|(known, _)| known == sensor).map(|(_, topic)| *topic);
+        let topics: Vec<Topic> = of_sensor.collect();
+        (!topics.contains(&topic)).then(|| Silence::UnknownTopic {
+            topic: format!("{sensor}/{}", topic.name()),
+            topics: topics.iter().map(|topic| topic.name().to_owned()).collect(),
+        })
+    }
+
+    /// Returns what the user can do about it. Empty for [`Silence::Waiting`].
+    pub fn remedy(&self) -> String {
+        match self {
+            Silence::NoHub { remedy, .. }
+            | Silence::OtherUser { remedy, .. }
+            | Silence::Full { remedy, .. } => Printable(remedy).to_string(),
+            Silence::UnknownSensor { sensors, .. } if sensors.is_empty() => {
+                "the hub has no sensors: scanhub run --link NAME=PORT adds one".to_owned()
+            }
+            Silence::UnknownSensor { sensors, .. } => format!("the sensors are {}", sensors.join(", ")),
+            Silence::UnknownTopic { topics, .. } => {
+                format!("the topics are {}; docs/configuration.md explains the others", topics.join(", "))
+            }
+            Silence::Absent { sensor, .. } => {
+                format!("`scanhub info {sensor}` shows the link; check cable, port and power of the scanner")
+            }
+            Silence::Paused { sensor } => format!("scanhub resume {sensor}"),
+            Silence::Waiting => String::new(),
+        }
+    }
+}
+
+impl fmt::Display for Silence {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Silence::NoHub { message, .. }
+            | Silence::OtherUser { message, .. }
+            | Silence::Full { message, .. } => {
+                write!(f, "{}", Printable(message))
+            }
+            Silence::UnknownSensor { sensor, .. } => write!(f, "the hub has no sensor {sensor}"),
+            Silence::UnknownTopic { topic, .. } => write!(f, "the hub does not publish {topic}"),
+            Silence::Absent { sensor, state, error } => {
+                write!(f, "the scanner of {sensor} sends no data: {}", state.name())?;
+                if error.is_empty() { Ok(()) } else { write!(f, ", {error}") }
+            }
+            Silence::Paused { sensor } => write!(f, "{sensor} is paused"),
+            Silence::Waiting => write!(f, "no sample has been sent yet"),
+        }
+    }
+}
+
+/// Finds the reason for the silence of one topic of one sensor. It follows the sensor's status only while it is used.
+#[derive(Default)]
+pub(crate) struct SilenceCheck {
+    status: Option<Box<(Follower<Status>, Option<Status>)>>,
+}
+
+impl SilenceCheck {
+    /// Returns why `follower` receives nothing. Never waits.
+    pub(crate) fn reason<P: Payload + ?Sized>(
+        &mut self,
+        session: &mut Session,
+        follower: &Follower<P>,
+    ) -> Silence {
+        let exhausted = |error: &Error| Silence::Full { message: error.message(), remedy: error.remedy() };
+        if let Err(error) = session.look() {
+            return exhausted(&error);
+        }
+        if let Some(error) = follower.refused() {
+            return exhausted(error);
+        }
+        let Some(domain) = session.domain() else {
+            self.status = None;
+            return session.absence();
+        };
+        let (sensor, topic) = (follower.sensor(), <P as Payload>::TOPIC);
+        if !follower.is_attached(session) {
+            if session.hub_is_starting() {
+                return Silence::Waiting;
+            }
+            return match scanhub_shm::published(domain) {
+                Ok(published) => Silence::of_topics(sensor, topic, &published).unwrap_or(Silence::Waiting),
+                Err(failure) => exhausted(&failure.into()),
+            };
+        }
+        if topic.maker() != Maker::Link {
+            return Silence::Waiting;
+        }
+        let (status, last) =
+            &mut **self.status.get_or_insert_with(|| Box::new((Follower::new(sensor), None)));
+        // Without its status, nothing is known of the sensor.
+        while let Ok(Some(status)) = status.receive_quietly(session) {
+            *last = Some(*status);
+        }
+        last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
+    }
+
+    /// Stops following the status, because a sample has arrived.
+    pub(crate) fn end(&mut self) {
+        self.status = None;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_status_shows_the_reason() {
+        let of = |state: State, error: &str| {
+            let mut status = Status { state: state as u8, ..Status::default() };
+            status.set_last_error(error);
+            Silence::of_status("front", &status)
+        };
+        assert_eq!(of(State::Streaming, "old"), Silence::Waiting);
+        assert_eq!(of(State::Paused, ""), Silence::Paused { sensor: "front".into() });
+        let absent = of(State::Absent, "no such port");
+        assert_eq!(absent.to_string(), "the scanner of front sends no data: absent, no such port");
+        assert!(absent.remedy().contains("scanhub info front"), "{}", absent.remedy());
+        assert_eq!(of(State::Silent, "").to_string(), "the scanner of front sends no data: silent");
+    }
+
+    #[test]
+    fn names_that_exist_are_the_remedy() {
+        let published = |names: &[(&str, Topic)]| {
+            names.iter().map(|(sensor, topic)| ((*sensor).to_owned(), *topic)).collect::<Vec<_>>()
+        };
+        let hub = published(&[("rear", Topic::Scan), ("front", Topic::Scan), ("front", Topic::Status)]);
+        let of = |sensor, topic| Silence::of_topics(sensor, topic, &hub);
+        assert_eq!(of("front", Topic::Scan), None);
+        let unknown = of("frnot", Topic::Scan).expect("there is no such sensor");
+        assert_eq!(unknown.to_string(), "the hub has no sensor frnot");
+        assert_eq!(unknown.remedy(), "the sensors are front, rear");
+        let unknown = of("front", Topic::Marks).expect("there is no such topic");
+        assert_eq!(unknown.to_string(), "the hub does not publish front/marks");
+        assert!(unknown.remedy().starts_with("the topics are scan, status"), "{}", unknown.remedy());
+        let empty = Silence::of_topics("front", Topic::Scan, &[]).expect("there is nothing");
+        assert!(empty.remedy().contains("scanhub run --link"), "{}", empty.remedy());
+        assert_eq!(Silence::Waiting.remedy(), "");
+    }
+}

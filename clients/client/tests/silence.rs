@@ -1,0 +1,154 @@
+//! Reasons for a silence, as a program sees them that asks once a second.
+
+mod fake;
+
+use std::time::{Duration, Instant};
+
+use fake::{FakeHub, Place, until};
+use scanhub_client::{Marks, Scan, Silence, Subscriber, ZonesSubscriber};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{State, Topic};
+use scanhub_shm::{Payload, PortFactory};
+
+fn scans(place: &Place, sensor: &str) -> Subscriber<Scan> {
+    let builder = Subscriber::<Scan>::builder(sensor).in_domain(&place.domain);
+    builder.timeout(Duration::from_millis(100)).open().unwrap()
+}
+
+/// Returns the reason after two seconds at most, as a program that calls `next` has it.
+fn reason(scans: &mut Subscriber<Scan>, is_it: impl Fn(&Silence) -> bool) -> Silence {
+    let started = Instant::now();
+    loop {
+        assert!(scans.next().unwrap().is_none(), "nothing was sent");
+        let silence = scans.why_silent();
+        // The bound is generous on a busy machine.
+        if is_it(&silence) || started.elapsed() > Duration::from_secs(20) {
+            return silence;
+        }
+    }
+}
+
+#[test]
+fn without_a_hub_it_says_so() {
+    let place = Place::new();
+    let mut scans = scans(&place, "front");
+    let silence = scans.why_silent();
+    assert!(matches!(silence, Silence::NoHub { .. }), "{silence}");
+    assert!(silence.to_string().contains(place.domain.name()), "{silence}");
+    assert!(silence.remedy().contains("scanhub run"), "{}", silence.remedy());
+}
+
+#[test]
+fn a_mistyped_sensor_is_unknown_and_the_names_are_the_remedy() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["rear", "front"], 1);
+    let mut scans = scans(&place, "frnot");
+    let silence = reason(&mut scans, |silence| matches!(silence, Silence::UnknownSensor { .. }));
+    let Silence::UnknownSensor { sensor, sensors, .. } = &silence else { panic!("{silence}") };
+    assert_eq!((&sensor[..], &sensors[..]), ("frnot", &["front".to_owned(), "rear".to_owned()][..]));
+    assert_eq!(silence.remedy(), "the sensors are front, rear");
+    let mut zones = ZonesSubscriber::builder("frnot").in_domain(&place.domain).open().unwrap();
+    assert!(matches!(zones.why_silent(), Silence::UnknownSensor { .. }));
+}
+
+#[test]
+fn the_state_of_the_link_is_the_reason() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut scans = scans(&place, "front");
+    assert_eq!(reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
+    let mut is = |state: State, expected: &dyn Fn(&Silence) -> bool| {
+        until("the reason", || {
+            hub.front().status(|status| {
+                status.state = state as u8;
+                status.set_last_error("no such port");
+            });
+            expected(&scans.why_silent())
+        });
+    };
+    is(State::Paused, &|silence| {
+        matches!(silence, Silence::Paused { .. }) && silence.remedy().contains("resume front")
+    });
+    is(State::Absent, &|silence| {
+        matches!(silence, Silence::Absent { state: State::Absent, .. })
+            && silence.to_string().contains("no such port")
+    });
+    is(State::Streaming, &|silence| *silence == Silence::Waiting);
+    // The status follows only during a silence, and is not a sample of the topic.
+    assert_eq!(hub.front().status.subscribers(), 1);
+    let silent_for = scans.silent_for();
+    hub.front().status(|_| {});
+    assert!(scans.try_next().unwrap().is_none() && scans.silent_for() >= silent_for);
+    hub.front().scan(&[1000]);
+    assert!(scans.next().unwrap().is_some());
+    assert_eq!(hub.front().status.subscribers(), 0);
+}
+
+#[test]
+fn a_topic_that_the_hub_does_not_publish_is_unknown() {
+    let place = Place::new();
+    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&place.domain).unwrap();
+    let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
+    let _scan = Scan::create(&node, "front", &TopicLimits::default()).unwrap();
+    lock.report_ready().unwrap();
+    let mut marks = Subscriber::<Marks>::builder("front").in_domain(&place.domain).open().unwrap();
+    let silence = marks.why_silent();
+    let Silence::UnknownTopic { topic, topics, .. } = &silence else { panic!("{silence}") };
+    assert_eq!((&topic[..], &topics[..]), ("front/marks", &[Topic::Scan.name().to_owned()][..]));
+}
+
+#[test]
+fn a_topic_without_a_place_is_full() {
+    let place = Place::new();
+    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&place.domain).unwrap();
+    let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
+    let limits = TopicLimits { consumers: 1, ..TopicLimits::default() };
+    let scan = Scan::create(&node, "front", &limits).unwrap();
+    lock.report_ready().unwrap();
+    let mut first = scans(&place, "front");
+    assert!(first.try_next().unwrap().is_none());
+    assert_eq!(scan.dynamic_config().number_of_subscribers(), 1);
+    let mut second = scans(&place, "front");
+    assert!(second.try_next().is_err());
+    let silence = second.why_silent();
+    assert!(matches!(silence, Silence::Full { .. }), "{silence}");
+    assert!(silence.remedy().contains("limits.consumers"), "{}", silence.remedy());
+    drop(first);
+    until("the place", || {
+        second.try_next().is_ok_and(|scan| scan.is_none()) && second.why_silent() == Silence::Waiting
+    });
+}
+
+#[test]
+fn a_domain_of_another_user_is_named() {
+    if !rustix::process::getuid().is_root() {
+        eprintln!("skipped: only root can make a directory of another user");
+        return;
+    }
+    let place = Place::new();
+    std::fs::create_dir(place.domain.root()).unwrap();
+    std::os::unix::fs::chown(place.domain.root(), Some(65_534), Some(65_534)).unwrap();
+    let silence = scans(&place, "front").why_silent();
+    assert!(matches!(silence, Silence::OtherUser { .. }), "{silence:?}");
+    assert!(silence.to_string().contains("belongs to user"), "{silence}");
+    assert!(silence.remedy().contains("run as user"), "{}", silence.remedy());
+}
+
+#[test]
+fn it_is_cheap_enough_for_once_a_second() {
+    let place = Place::new();
+    let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    let [mut known, mut unknown] = ["front", "frnot"].map(|sensor| scans(&place, sensor));
+    let elsewhere = Place::new();
+    let mut absent = scans(&elsewhere, "front");
+    for (name, scans) in [("known", &mut known), ("unknown", &mut unknown), ("no hub", &mut absent)] {
+        scans.why_silent();
+        let started = Instant::now();
+        (0..10).for_each(|_| drop(scans.why_silent()));
+        let each = started.elapsed() / 10;
+        eprintln!("{name}: {each:?}");
+        assert!(each < Duration::from_millis(200), "{name}: {each:?}");
+    }
+}
