@@ -8,6 +8,7 @@ use scanhub_schema::check_followed;
 use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
 
 use crate::error::Error;
+use crate::joined::JoinedSubscriber;
 use crate::pollable::{Pollable, PollableSubscriber};
 use crate::robot::{RobotSource, RobotSubscriber};
 use crate::session::Session;
@@ -15,7 +16,8 @@ use crate::subscribe::Subscriber;
 use crate::wait::Wait;
 use crate::zones::ZonesSubscriber;
 
-/// Options of a subscriber of type `T`: a [`Subscriber`], [`ZonesSubscriber`] or [`RobotSubscriber`].
+/// Options of a subscriber of type `T`: a [`Subscriber`], [`JoinedSubscriber`], [`ZonesSubscriber`] or
+/// [`RobotSubscriber`].
 ///
 /// # Examples
 ///
@@ -127,6 +129,34 @@ impl<P: Payload + ?Sized> SubscriberBuilder<Subscriber<P>> {
         let mut session = self.session()?;
         let descriptor = session.pollable()?;
         Ok(Pollable::new(descriptor, Subscriber::new(session, self.sensor(), self.timeout)))
+    }
+}
+
+impl<A: Payload + ?Sized, B: Payload + ?Sized> SubscriberBuilder<JoinedSubscriber<A, B>> {
+    /// Lets [`JoinedSubscriber::next`] return `None` after a silence of `timeout`. Default: it waits forever.
+    pub fn timeout(self, timeout: Duration) -> Self {
+        SubscriberBuilder { timeout: Some(timeout), ..self }
+    }
+
+    /// Creates the subscriber. The hub may start later.
+    ///
+    /// # Errors
+    ///
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of the sensor or of the domain is invalid.
+    pub fn open(self) -> Result<JoinedSubscriber<A, B>, Error> {
+        Ok(JoinedSubscriber::new(self.session()?, self.sensor(), self.timeout))
+    }
+
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
+    /// [`wait`](Self::wait) says.
+    ///
+    /// # Errors
+    ///
+    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    pub fn open_pollable(self) -> Result<Pollable<JoinedSubscriber<A, B>>, Error> {
+        let mut session = self.session()?;
+        let descriptor = session.pollable()?;
+        Ok(Pollable::new(descriptor, JoinedSubscriber::new(session, self.sensor(), self.timeout)))
     }
 }
 

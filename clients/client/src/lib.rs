@@ -3,6 +3,7 @@
 //!
 //! - [`subscribe`] subscribes to one topic of one sensor in shared memory. It makes no copy, and continues after
 //!   restarts of the hub.
+//! - [`joined`] subscribes to two topics, and returns the samples of one telegram in pairs.
 //! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
 //!   [`Verdict::Unknown`].
 //! - `SubscriberBuilder::open_pollable` returns a subscriber with a descriptor for `poll` or an executor. With the feature
@@ -37,6 +38,7 @@ mod error;
 mod follower;
 mod hub_monitor;
 mod join;
+mod joined;
 mod pollable;
 mod presence;
 mod publish;
@@ -54,6 +56,7 @@ pub use builder::SubscriberBuilder;
 pub use control::request;
 pub use error::{Cause, Error, ErrorKind};
 pub use follower::Received;
+pub use joined::{Joined, JoinedSubscriber, joined};
 pub use pollable::{Pollable, PollableSubscriber};
 pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};

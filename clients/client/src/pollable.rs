@@ -8,6 +8,7 @@ use scanhub_shm::Payload;
 
 use crate::error::Error;
 use crate::follower::Received;
+use crate::joined::{Joined, JoinedSubscriber};
 use crate::robot::{Robot, RobotSubscriber};
 use crate::silence::Silence;
 #[cfg(feature = "tokio")]
@@ -119,6 +120,32 @@ impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
     }
 
     /// As [`Subscriber::silent_for`].
+    pub fn silent_for(&self) -> Duration {
+        self.locked().silent_for()
+    }
+}
+
+impl<A: Payload + ?Sized, B: Payload + ?Sized> Pollable<JoinedSubscriber<A, B>> {
+    /// Returns the next pair if both of its samples have arrived. It never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`JoinedSubscriber::next`].
+    pub fn try_next(&self) -> Result<Option<Joined<A, B>>, Error> {
+        self.locked().try_next()
+    }
+
+    /// As [`JoinedSubscriber::hub_is_running`].
+    pub fn hub_is_running(&self) -> bool {
+        self.locked().hub_is_running()
+    }
+
+    /// As [`JoinedSubscriber::why_silent`].
+    pub fn why_silent(&self) -> Silence {
+        self.locked().why_silent()
+    }
+
+    /// As [`JoinedSubscriber::silent_for`].
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }

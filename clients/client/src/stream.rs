@@ -14,6 +14,7 @@ use tokio::runtime::Handle;
 
 use crate::error::Error;
 use crate::follower::Received;
+use crate::joined::{Joined, JoinedSubscriber};
 use crate::pollable::Pollable;
 use crate::robot::{Robot, RobotSubscriber};
 use crate::subscribe::Subscriber;
@@ -90,6 +91,15 @@ impl<P: Payload + ?Sized> Stream for Pollable<Subscriber<P>> {
 
     fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         self.get_mut().poll_items(cx, Subscriber::try_next)
+    }
+}
+
+/// Pairs as they arrive. The stream never ends, and a dropped future loses no pair.
+impl<A: Payload + ?Sized, B: Payload + ?Sized> Stream for Pollable<JoinedSubscriber<A, B>> {
+    type Item = Result<Joined<A, B>, Error>;
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.get_mut().poll_items(cx, JoinedSubscriber::try_next)
     }
 }
 

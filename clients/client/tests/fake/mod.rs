@@ -129,14 +129,24 @@ impl FakeSensor {
     /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the sample is
     /// `seq` ns after that of the hub's first one.
     pub(crate) fn scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
+        self.foreground(seq, ranges.len());
+        self.scan(ranges);
+    }
+
+    /// Publishes the empty foreground of a scan of `beams`, and wakes no subscriber. The next scan is of the same telegram.
+    pub(crate) fn foreground(&mut self, seq: u64, beams: usize) {
         self.seq = seq;
         let header = self.header(self.foreground.topic_seq);
-        let mut sample = Foreground::loan(&self.foreground.publisher, Foreground::len(ranges.len())).unwrap();
+        let mut sample = Foreground::loan(&self.foreground.publisher, Foreground::len(beams)).unwrap();
         *sample.user_header_mut() = header;
-        Foreground::write(&mut sample).copy_from(Foreground::of(ranges.len()).bytes());
+        Foreground::write(&mut sample).copy_from(Foreground::of(beams).bytes());
         sample.send().unwrap();
         self.foreground.topic_seq += 1;
-        self.scan(ranges);
+    }
+
+    /// Wakes the subscribers.
+    pub(crate) fn wake(&self) {
+        self.waker.wake(Wake::Telegram).unwrap();
     }
 
     /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the consumers.

@@ -1,0 +1,256 @@
+//! Subscribes to two topics that the hub computes from the same telegram, such as `scan` and `foreground`, and returns
+//! their samples in pairs.
+//!
+//! Each topic is in order, so one sample of each is enough: if their numbers differ, the earlier one has no partner.
+
+use std::time::{Duration, Instant};
+
+use scanhub_schema::Header;
+use scanhub_shm::Payload;
+
+use crate::builder::SubscriberBuilder;
+use crate::clock;
+use crate::error::Error;
+use crate::follower::{Follower, Received};
+use crate::session::Session;
+use crate::silence::{Silence, SilenceCheck};
+
+/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples come
+/// in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
+///
+/// # Examples
+///
+/// ```no_run
+/// use scanhub_client::{Error, Foreground, Scan, joined};
+///
+/// fn main() -> Result<(), Error> {
+///     for pair in joined::<Scan, Foreground>("front")?.iter() {
+///         let pair = pair?;
+///         println!("{} beams, {} missed", pair.first.beams(), pair.missed);
+///     }
+///     Ok(())
+/// }
+/// ```
+///
+/// # Errors
+///
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is invalid.
+pub fn joined<A: Payload + ?Sized, B: Payload + ?Sized>(
+    sensor: &str,
+) -> Result<JoinedSubscriber<A, B>, Error> {
+    JoinedSubscriber::builder(sensor).open()
+}
+
+/// Two samples of one telegram.
+#[derive(Debug)]
+pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
+    /// The sample of the first topic.
+    pub first: Received<A>,
+    /// The sample of the second topic.
+    pub second: Received<B>,
+    /// Pairs between the last one and this one that were not received whole: one or both samples were missed, or one was
+    /// never sent. 0 for the first pair.
+    pub missed: u64,
+    /// Whether the hub was restarted since the last pair.
+    pub restarted: bool,
+}
+
+/// Subscriber of two topics of one sensor. A sample waits for its partner for one period at most.
+pub struct JoinedSubscriber<A: Payload + ?Sized, B: Payload + ?Sized> {
+    session: Session,
+    first: Side<A>,
+    second: Side<B>,
+    timeout: Option<Duration>,
+    /// Whether a pair was returned before.
+    has_begun: bool,
+    silence: SilenceCheck,
+}
+
+/// One of the two topics.
+struct Side<P: Payload + ?Sized> {
+    follower: Follower<P>,
+    /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
+    waiting: Option<(Received<P>, u64)>,
+    /// Samples since the last pair that were missed or have no partner.
+    lost: u64,
+    restarted: bool,
+}
+
+/// Wait for the partner of a sample without a period, in ns.
+const NO_PERIOD_NS: u64 = 500_000_000;
+
+impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
+    /// Returns the options of a subscriber of two topics of `sensor`.
+    pub fn builder(sensor: &str) -> SubscriberBuilder<JoinedSubscriber<A, B>> {
+        SubscriberBuilder::new(&[sensor])
+    }
+
+    pub(crate) fn new(session: Session, sensor: &str, timeout: Option<Duration>) -> JoinedSubscriber<A, B> {
+        let (first, second) = (Side::new(sensor), Side::new(sensor));
+        JoinedSubscriber {
+            session,
+            first,
+            second,
+            timeout,
+            has_begun: false,
+            silence: SilenceCheck::default(),
+        }
+    }
+
+    /// Waits for the next pair; `None` only after the timeout. Up to three pairs may be held while others are received.
+    ///
+    /// # Errors
+    ///
+    /// As [`Subscriber::next`](crate::Subscriber::next).
+    #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
+    pub fn next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
+        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            if let Some(pair) = self.try_next()? {
+                return Ok(Some(pair));
+            }
+            let left = until.map(|until| until.saturating_duration_since(Instant::now()));
+            if left == Some(Duration::ZERO) {
+                return Ok(None);
+            }
+            self.wait(left.unwrap_or(Duration::MAX))?;
+        }
+    }
+
+    /// Returns an iterator over the pairs, which waits for each of them. It ends after a silence of the timeout; a later
+    /// call continues.
+    pub fn iter(&mut self) -> impl Iterator<Item = Result<Joined<A, B>, Error>> + '_ {
+        std::iter::from_fn(|| self.next().transpose())
+    }
+
+    /// Returns the next pair if both of its samples have arrived. It never waits.
+    ///
+    /// # Errors
+    ///
+    /// As [`next`](Self::next).
+    pub fn try_next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
+        loop {
+            if let Some(pair) = self.look()? {
+                return Ok(Some(pair));
+            }
+            let left = self.left();
+            if !self.session.settle(left)? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until a sample has waited for its partner long
+    /// enough.
+    ///
+    /// # Errors
+    ///
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
+    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
+        self.session.wait_for(Some(self.left().map_or(longest, |left| left.min(longest))))
+    }
+
+    /// As [`Subscriber::hub_is_running`](crate::Subscriber::hub_is_running).
+    pub fn hub_is_running(&self) -> bool {
+        self.session.domain().is_some()
+    }
+
+    /// Returns the time since a sample of either topic, as [`Subscriber::silent_for`](crate::Subscriber::silent_for)
+    /// does.
+    pub fn silent_for(&self) -> Duration {
+        self.session.silent_for()
+    }
+
+    /// Returns why no sample of one of the topics arrives, as
+    /// [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
+    pub fn why_silent(&mut self) -> Silence {
+        match self.silence.reason(&mut self.session, &self.first.follower) {
+            Silence::Waiting => self.silence.reason(&mut self.session, &self.second.follower),
+            reason => reason,
+        }
+    }
+
+    fn look(&mut self) -> Result<Option<Joined<A, B>>, Error> {
+        // Samples that have arrived come first, because the look for the hub takes longer than receiving.
+        let is_subscribed = self.first.follower.subscribed() && self.second.follower.subscribed();
+        if is_subscribed && let Some(pair) = self.join()? {
+            self.silence.end();
+            return Ok(Some(pair));
+        }
+        self.session.look()?;
+        self.join()
+    }
+
+    /// Receives until there is a pair, or nothing more to receive.
+    fn join(&mut self) -> Result<Option<Joined<A, B>>, Error> {
+        loop {
+            self.first.fill(&mut self.session)?;
+            self.second.fill(&mut self.session)?;
+            let is_first_earlier = match (self.first.header(), self.second.header()) {
+                (Some(a), Some(b)) if (a.boot, a.seq) == (b.boot, b.seq) => return Ok(self.pair()),
+                (Some(a), Some(b)) if a.boot == b.boot => a.seq < b.seq,
+                // Of two runs of the hub, the earlier one has ended.
+                (Some(a), Some(b)) => a.stamp_last_ns < b.stamp_last_ns,
+                (Some(_), None) if self.first.is_overdue() => true,
+                (None, Some(_)) if self.second.is_overdue() => false,
+                _ => return Ok(None),
+            };
+            if is_first_earlier { self.first.discard() } else { self.second.discard() }
+        }
+    }
+
+    fn pair(&mut self) -> Option<Joined<A, B>> {
+        let (first, second) = (self.first.waiting.take()?.0, self.second.waiting.take()?.0);
+        // Each topic has lost every pair that was not whole.
+        let lost = std::mem::take(&mut self.first.lost).max(std::mem::take(&mut self.second.lost));
+        let missed = if std::mem::replace(&mut self.has_begun, true) { lost } else { 0 };
+        let restarted =
+            std::mem::take(&mut self.first.restarted) | std::mem::take(&mut self.second.restarted);
+        Some(Joined { first, second, missed, restarted })
+    }
+
+    /// Returns the time until a sample has waited for its partner long enough.
+    fn left(&self) -> Option<Duration> {
+        let overdue = [self.first.overdue_ns(), self.second.overdue_ns()].into_iter().flatten().min()?;
+        Some(Duration::from_nanos(overdue.saturating_sub(clock::now_ns())))
+    }
+}
+
+impl<P: Payload + ?Sized> Side<P> {
+    fn new(sensor: &str) -> Side<P> {
+        Side { follower: Follower::new(sensor), waiting: None, lost: 0, restarted: false }
+    }
+
+    /// Receives a sample, if none waits.
+    fn fill(&mut self, session: &mut Session) -> Result<(), Error> {
+        if self.waiting.is_none()
+            && let Some(sample) = self.follower.receive(session)?
+        {
+            self.lost += sample.missed;
+            self.restarted |= sample.restarted;
+            let period_ns = match sample.header().period_us {
+                0 => NO_PERIOD_NS,
+                period_us => u64::from(period_us) * 1000,
+            };
+            self.waiting = Some((sample, clock::now_ns() + period_ns));
+        }
+        Ok(())
+    }
+
+    fn header(&self) -> Option<&Header> {
+        self.waiting.as_ref().map(|(sample, _)| sample.header())
+    }
+
+    fn overdue_ns(&self) -> Option<u64> {
+        self.waiting.as_ref().map(|(_, overdue_ns)| *overdue_ns)
+    }
+
+    fn is_overdue(&self) -> bool {
+        self.overdue_ns().is_some_and(|overdue_ns| overdue_ns <= clock::now_ns())
+    }
+
+    /// Drops the sample that waits.
+    fn discard(&mut self) {
+        self.lost += u64::from(self.waiting.take().is_some());
+    }
+}
