@@ -12,7 +12,7 @@ use std::process;
 use std::ptr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, Who, find};
 use scanhub_client::{
@@ -22,11 +22,15 @@ use scanhub_client::{
 use scanhub_schema::{Failure, limits};
 
 use crate::error::Error;
+use crate::sample::{Memory, Sample};
 
 type ClientError = scanhub_client::Error;
 
 /// Maximum time of one wait. After it, the caller handles signals.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
+
+/// Time without a first sample after which the program gets a warning, if there is no hub or a topic is missing.
+const WARN_AFTER: Duration = Duration::from_secs(2);
 
 /// Topic of a sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -155,10 +159,11 @@ pub(crate) trait Follow: Sized + Send {
     /// Uses events from now on, and returns the descriptor to poll.
     fn descriptor(&mut self) -> Result<i32, Error>;
 
-    /// Returns whether the program has closed it.
-    fn has_left(&self) -> bool {
-        false
-    }
+    /// Leaves the domain for good.
+    fn leave(&mut self);
+
+    /// Returns whether it has left the domain.
+    fn has_left(&self) -> bool;
 
     /// Returns whether a hub or listener publishes in the domain, as of the last look.
     fn hub_lives(&self) -> bool;
@@ -166,6 +171,11 @@ pub(crate) trait Follow: Sized + Send {
     /// Returns the changes of the hub since the last call, oldest first.
     fn notices(&mut self) -> Vec<&'static str> {
         Vec::new()
+    }
+
+    /// Returns the reason why nothing was received, once after [`WARN_AFTER`].
+    fn warning(&mut self) -> Option<Error> {
+        None
     }
 
     /// Returns the error after a silence of `timeout`.
@@ -189,6 +199,8 @@ pub(crate) struct Topics {
     /// Indexes of the kept samples that the program has dropped.
     dropped: Arc<Mutex<Vec<usize>>>,
     notices: Vec<&'static str>,
+    /// Time of the first look; `None` before it, and after the first sample or the warning.
+    silent_since: Option<Instant>,
     has_left: bool,
 }
 
@@ -197,24 +209,6 @@ struct Followed {
     source: Source,
     last: Header,
     is_first: bool,
-}
-
-/// A received sample.
-pub(crate) struct Received {
-    pub(crate) name: Name,
-    /// Header of the sample. In a silence of zones, that of the last sample.
-    pub(crate) header: Header,
-    pub(crate) missed: u64,
-    pub(crate) restarted: bool,
-    /// Whether zones are unknown because no recent data arrived.
-    pub(crate) stale: bool,
-    pub(crate) payload: Payload,
-}
-
-/// Payload of a received sample.
-pub(crate) enum Payload {
-    Held(Held),
-    Own(Vec<u8>),
 }
 
 impl Topics {
@@ -234,15 +228,9 @@ impl Topics {
             kept: Vec::new(),
             dropped: Arc::default(),
             notices: Vec::new(),
+            silent_since: None,
             has_left: false,
         })
-    }
-
-    /// Ends the subscription. Samples that the program keeps stay.
-    pub(crate) fn leave(&mut self) {
-        self.has_left = true;
-        self.sources.clear();
-        self.session = Session::new(Vec::new());
     }
 
     /// Gives the samples back to the hub that the program has dropped.
@@ -323,18 +311,28 @@ impl Topics {
 }
 
 impl Follow for Topics {
-    type Item = Received;
+    type Item = Sample;
+
+    fn leave(&mut self) {
+        self.has_left = true;
+        // Samples that the program keeps stay.
+        self.sources.clear();
+        self.session = Session::new(Vec::new());
+    }
 
     fn has_left(&self) -> bool {
         self.has_left
     }
 
-    fn try_next(this: &Arc<Confined<Topics>>) -> Result<Option<Received>, Error> {
+    fn try_next(this: &Arc<Confined<Topics>>) -> Result<Option<Sample>, Error> {
         let mut value = this.lock();
         let Some(topics) = value.as_mut() else { return Ok(None) };
-        topics.wait = topics.wait.or(Some(Wait::Doorbell));
+        if topics.wait.is_none() {
+            (topics.wait, topics.silent_since) = (Some(Wait::Doorbell), Some(Instant::now()));
+        }
         topics.give_back();
         let Some((index, sample)) = topics.look_and_receive()? else { return Ok(None) };
+        topics.silent_since = None;
         let followed = &mut topics.sources[index];
         let header = sample.header().copied();
         let restarted = header.is_some_and(|header| !followed.is_first && header.boot != followed.last.boot);
@@ -343,9 +341,9 @@ impl Follow for Topics {
         }
         let (name, header) = (followed.name.clone(), followed.last);
         let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(heard) if heard.stale));
-        let payload = match &sample {
+        let memory = match &sample {
             // The client library has a copy already.
-            AnySample::Zones(_) => Payload::Own(sample.bytes().to_vec()),
+            AnySample::Zones(_) => Memory::copy_of(sample.bytes()),
             _ => {
                 let bytes = sample.bytes();
                 let (address, len) = (bytes.as_ptr().expose_provenance(), bytes.len());
@@ -358,10 +356,10 @@ impl Follow for Topics {
                 );
                 let number = topics.keep(index, sample);
                 let dropped = Arc::clone(&topics.dropped);
-                Payload::Held(Held { address, len, is_of_words, number, dropped, of: Arc::clone(this) })
+                Memory::Hub(Held { address, len, is_of_words, number, dropped, of: Arc::clone(this) })
             }
         };
-        Ok(Some(Received { name, header, missed, restarted, stale, payload }))
+        Ok(Some(Sample { name, header, missed, restarted, stale, memory: Arc::new(memory) }))
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
@@ -373,6 +371,7 @@ impl Follow for Topics {
         if self.wait.is_none() {
             self.descriptor = Some(self.session.pollable()?);
             self.wait = Some(Wait::Event);
+            self.silent_since = Some(Instant::now());
         }
         self.descriptor.as_ref().map(|descriptor| descriptor.as_raw_fd()).ok_or_else(Error::mixed)
     }
@@ -383,6 +382,12 @@ impl Follow for Topics {
 
     fn notices(&mut self) -> Vec<&'static str> {
         mem::take(&mut self.notices)
+    }
+
+    fn warning(&mut self) -> Option<Error> {
+        self.silent_since.take_if(|since| since.elapsed() >= WARN_AFTER)?;
+        let is_missing = self.sources.iter().any(|followed| !followed.source.subscribed());
+        (self.session.domain().is_none() || is_missing).then(|| self.silence(WARN_AFTER.as_secs_f64()))
     }
 
     fn silence(&self, timeout: f64) -> Error {
@@ -457,7 +462,8 @@ pub(crate) struct Verdicts {
     sensors: Vec<String>,
     place: Place,
     early: bool,
-    robot: RobotSubscriber,
+    /// `None` after it has left.
+    robot: Option<RobotSubscriber>,
     /// Takes the place of `robot` if the program polls.
     pollable: Option<Pollable<RobotSubscriber>>,
     wait: Option<Wait>,
@@ -480,40 +486,54 @@ impl Default for Verdict {
 
 impl Verdicts {
     pub(crate) fn new(sensors: &[&str], place: &Place, early: bool) -> Result<Verdicts, Error> {
-        let robot = builder(sensors, place, early).open()?;
+        let robot = Some(builder(sensors, place, early).open()?);
         let sensors = sensors.iter().map(|&sensor| sensor.to_owned()).collect();
         Ok(Verdicts { sensors, place: place.clone(), early, robot, pollable: None, wait: None })
     }
 
     /// Returns what is known now. Never waits.
     pub(crate) fn now(&mut self) -> Result<Verdict, Error> {
-        Ok(verdict(self.subscriber().now()?))
+        self.subscriber().map_or(Ok(Verdict::default()), |robot| Ok(verdict(robot.now()?)))
     }
 
-    fn subscriber(&mut self) -> &mut RobotSubscriber {
-        self.pollable.as_mut().map_or(&mut self.robot, Pollable::get_mut)
+    fn subscriber(&mut self) -> Option<&mut RobotSubscriber> {
+        match &mut self.pollable {
+            Some(pollable) => Some(pollable.get_mut()),
+            None => self.robot.as_mut(),
+        }
     }
 }
 
 impl Follow for Verdicts {
     type Item = Verdict;
 
+    fn leave(&mut self) {
+        (self.robot, self.pollable) = (None, None);
+    }
+
+    fn has_left(&self) -> bool {
+        self.robot.is_none() && self.pollable.is_none()
+    }
+
     fn try_next(this: &Arc<Confined<Verdicts>>) -> Result<Option<Verdict>, Error> {
         let mut value = this.lock();
         let Some(verdicts) = value.as_mut() else { return Ok(None) };
         verdicts.wait = verdicts.wait.or(Some(Wait::Doorbell));
-        Ok(verdicts.subscriber().try_next()?.map(verdict))
+        let Some(robot) = verdicts.subscriber() else { return Ok(None) };
+        Ok(robot.try_next()?.map(verdict))
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        Ok(self.subscriber().wait(longest.min(LONGEST_WAIT))?)
+        self.subscriber().map_or(Ok(()), |robot| Ok(robot.wait(longest.min(LONGEST_WAIT))?))
     }
 
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
             // Nothing was received, so another subscriber misses nothing.
-            let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
-            self.pollable = Some(builder(&sensors, &self.place, self.early).open_pollable()?);
+            if self.robot.take().is_some() {
+                let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
+                self.pollable = Some(builder(&sensors, &self.place, self.early).open_pollable()?);
+            }
             self.wait = Some(Wait::Event);
         }
         self.pollable.as_ref().map(AsRawFd::as_raw_fd).ok_or_else(Error::mixed)
@@ -522,7 +542,7 @@ impl Follow for Verdicts {
     fn hub_lives(&self) -> bool {
         match &self.pollable {
             Some(pollable) => pollable.hub_is_running(),
-            None => self.robot.hub_is_running(),
+            None => self.robot.as_ref().is_some_and(RobotSubscriber::hub_is_running),
         }
     }
 }

@@ -1,5 +1,7 @@
 //! Errors as exceptions of the Python package.
 
+use std::ffi::CString;
+
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyModule, PyTuple};
@@ -15,6 +17,15 @@ pub(crate) struct Error {
 impl Error {
     pub(crate) fn new(class: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Error {
         Error { class, message: message.into(), remedy: remedy.into() }
+    }
+}
+
+impl Error {
+    /// Warns the program with `SilenceWarning`. Fails if warnings are errors.
+    pub(crate) fn warn(&self, py: Python<'_>) -> PyResult<()> {
+        let text = format!("nothing yet: {}\n  {}", self.message, self.remedy);
+        let category = PyModule::import(py, "scanhub.errors")?.getattr("SilenceWarning")?;
+        PyErr::warn(py, &category, &CString::new(text)?, 1)
     }
 }
 

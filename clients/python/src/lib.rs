@@ -24,6 +24,8 @@ use sample::Sample;
 
 #[pymodule]
 fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    // With the first array, it would delay the first sample.
+    module.py().import("numpy")?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("__commit__", env!("SCANHUB_COMMIT"))?;
     module.add_class::<Sample>()?;

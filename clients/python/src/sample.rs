@@ -10,7 +10,7 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyBytes, PyDict, PyFrozenSet, PyTuple};
 use scanhub_client::{Background, Flags, Header, Reasons, Topic};
 
-use crate::client::{Held, Name, Payload, Received};
+use crate::client::{Held, Name};
 use crate::topics;
 
 /// Payload of a sample.
@@ -45,148 +45,112 @@ impl Memory {
     }
 }
 
+/// Implements the properties of a class, and then its methods. Each property is an expression of the object, the
+/// sample and its payload.
+#[macro_export]
+macro_rules! getters {
+    (
+        $class:ident($slf:ident, $sample:ident: $access:expr, $payload:ident) = $read:expr;
+        $($(#[$($doc:tt)*])* $name:ident: $type:ty = $value:expr;)*
+        $(+ { $($methods:tt)* })?
+    ) => {
+        #[pymethods]
+        impl $class {
+            $(
+                $(#[$($doc)*])*
+                #[getter]
+                #[allow(unused_variables, clippy::extra_unused_lifetimes)]
+                fn $name<'a, 'py>($slf: &'a Bound<'py, Self>) -> $type {
+                    let $sample = $access;
+                    let $payload = $read;
+                    $value
+                }
+            )*
+
+            $($($methods)*)?
+        }
+    };
+}
+
 /// A sample of any topic. Its payload stays in shared memory until the sample and all of its arrays are dropped.
 #[pyclass(subclass, frozen, module = "scanhub")]
+#[derive(Clone)]
 pub(crate) struct Sample {
     pub(crate) name: Name,
+    /// Header of the sample. In a silence of zones, that of the last sample.
     pub(crate) header: Header,
-    missed: u64,
-    restarted: bool,
+    pub(crate) missed: u64,
+    pub(crate) restarted: bool,
+    /// Whether zones are unknown because no recent data arrived.
     pub(crate) stale: bool,
     pub(crate) memory: Arc<Memory>,
 }
 
-impl From<Received> for Sample {
-    fn from(received: Received) -> Sample {
-        let Received { name, header, missed, restarted, stale, payload } = received;
-        let memory = match payload {
-            Payload::Held(held) => Memory::Hub(held),
-            Payload::Own(bytes) => Memory::copy_of(&bytes),
-        };
-        Sample { name, header, missed, restarted, stale, memory: Arc::new(memory) }
-    }
-}
-
-#[pymethods]
-impl Sample {
+getters! {
+    Sample(slf, sample: slf.get(), header) = &sample.header;
     /// Name of the sensor.
-    #[getter]
-    fn sensor(&self) -> &str {
-        &self.name.sensor
-    }
-
+    sensor: &'a str = &sample.name.sensor;
     /// Name of the topic.
-    #[getter]
-    fn topic(&self) -> &str {
-        self.name.topic.name()
-    }
-
+    topic: &'a str = sample.name.topic.name();
     /// Samples of this topic that were sent before this one and not received.
-    #[getter]
-    fn missed(&self) -> u64 {
-        self.missed
-    }
-
+    missed: u64 = sample.missed;
     /// Whether another run of the hub sent the previous sample, so that the numbers started again.
-    #[getter]
-    fn restarted(&self) -> bool {
-        self.restarted
-    }
-
+    restarted: bool = sample.restarted;
     /// Number of the telegram, per sensor and run of the hub, from 0. A status has that of the last telegram.
-    #[getter]
-    fn seq(&self) -> u64 {
-        self.header.seq
-    }
-
+    seq: u64 = header.seq;
     /// Number of the sample in its topic, from 0. A gap means missed samples.
-    #[getter]
-    fn topic_seq(&self) -> u64 {
-        self.header.topic_seq
-    }
-
+    topic_seq: u64 = header.topic_seq;
     /// Stamp of the telegram's first byte, in ns of `time.monotonic_ns()`.
-    #[getter]
-    fn stamp_ns(&self) -> u64 {
-        self.header.stamp_first_ns
-    }
-
+    stamp_ns: u64 = header.stamp_first_ns;
     /// Stamp of the telegram's last byte, in ns of `time.monotonic_ns()`.
-    #[getter]
-    fn stamp_last_ns(&self) -> u64 {
-        self.header.stamp_last_ns
-    }
-
+    stamp_last_ns: u64 = header.stamp_last_ns;
     /// Wall clock of the telegram's first byte, in ns since 1970.
-    #[getter]
-    fn wall_ns(&self) -> u64 {
-        self.header.wall_ns
-    }
-
+    wall_ns: u64 = header.wall_ns;
     /// Random number of the hub's run.
-    #[getter]
-    fn boot(&self) -> u64 {
-        self.header.boot
-    }
-
+    boot: u64 = header.boot;
     /// `clean`, or `suspect` if the telegram may be damaged.
-    #[getter]
-    fn quality(&self) -> &'static str {
-        if self.header.quality == 0 { "clean" } else { "suspect" }
-    }
-
+    quality: &'static str = if header.quality == 0 { "clean" } else { "suspect" };
     /// Reasons why the telegram is suspect.
-    #[getter]
-    fn reasons<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
-        PyTuple::new(py, Reasons::names(self.header.reasons).collect::<Vec<_>>())
-    }
-
+    reasons: PyResult<Bound<'py, PyTuple>> = PyTuple::new(slf.py(), Reasons::names(header.reasons).collect::<Vec<_>>());
     /// Flags that are set: `simulated`, `replayed`, `stamp_estimated`, `remote`.
-    #[getter]
-    fn flags<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyFrozenSet>> {
-        PyFrozenSet::new(py, Flags::names(self.header.flags))
-    }
-
+    flags: PyResult<Bound<'py, PyFrozenSet>> = PyFrozenSet::new(slf.py(), Flags::names(header.flags));
     /// Nominal period of the scans in microseconds; None if unknown.
-    #[getter]
-    fn period_us(&self) -> Option<u32> {
-        Some(self.header.period_us).filter(|period_us| *period_us != 0)
-    }
-
+    period_us: Option<u32> = Some(header.period_us).filter(|period_us| *period_us != 0);
     /// Time from the telegram's last byte until the sample was sent, in steps of 256 ns; None if unknown or more than 4 s.
-    #[getter]
-    fn hub_time_ns(&self) -> Option<u64> {
-        self.header.hub_time_ns()
-    }
+    hub_time_ns: Option<u64> = header.hub_time_ns();
 
-    /// Returns the same sample with a payload of its own, which can be kept and pickled.
-    fn copy(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
-        topics::wrap(py, self.clone_with(Memory::copy_of(self.memory.bytes())))
-    }
-
-    fn __copy__(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
-        self.copy(py)
-    }
-
-    fn __deepcopy__(&self, py: Python<'_>, _memo: &Bound<'_, PyAny>) -> PyResult<Py<PyAny>> {
-        self.copy(py)
-    }
-
-    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
-        if let Memory::Hub(_) = &*self.memory {
-            let what = "a sample in shared memory cannot be pickled; pickle `sample.copy()`";
-            return Err(PyTypeError::new_err(what));
+    + {
+        /// Returns the same sample with a payload of its own, which can be kept and pickled.
+        fn copy(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+            let memory = Arc::new(Memory::copy_of(self.memory.bytes()));
+            topics::wrap(py, Sample { memory, ..self.clone() })
         }
-        let header = PyBytes::new(py, bytes_of(&self.header));
-        let payload = PyBytes::new(py, self.memory.bytes());
-        let name = (self.sensor(), self.topic());
-        let state = (self.missed, self.restarted, self.stale);
-        let fields = (name.0, name.1, header, payload, state);
-        Ok((py.import("scanhub._scanhub")?.getattr("_restore")?, fields.into_pyobject(py)?))
-    }
 
-    fn __repr__(&self) -> String {
-        format!("<{}/{} {}, {}>", self.sensor(), self.topic(), self.topic_seq(), self.quality())
+        fn __copy__(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+            self.copy(py)
+        }
+
+        fn __deepcopy__(&self, py: Python<'_>, _memo: &Bound<'_, PyAny>) -> PyResult<Py<PyAny>> {
+            self.copy(py)
+        }
+
+        fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyTuple>)> {
+            if let Memory::Hub(_) = &*self.memory {
+                let what = "a sample in shared memory cannot be pickled; pickle `sample.copy()`";
+                return Err(PyTypeError::new_err(what));
+            }
+            let header = PyBytes::new(py, bytes_of(&self.header));
+            let payload = PyBytes::new(py, self.memory.bytes());
+            let name = (&*self.name.sensor, self.name.topic.name());
+            let state = (self.missed, self.restarted, self.stale);
+            let fields = (name.0, name.1, header, payload, state);
+            Ok((py.import("scanhub._scanhub")?.getattr("_restore")?, fields.into_pyobject(py)?))
+        }
+
+        fn __repr__(&self) -> String {
+            let Name { sensor, topic } = &self.name;
+            format!("<{sensor}/{} {}, {}>", topic.name(), self.header.topic_seq, self.header.quality().name())
+        }
     }
 }
 
@@ -196,19 +160,6 @@ impl Sample {
         let name = Name { sensor: sensor.into(), topic: Topic::Background };
         let memory = Arc::new(Memory::copy_of(model.bytes()));
         Sample { name, header: Header::default(), missed: 0, restarted: false, stale: false, memory }
-    }
-
-    fn clone_with(&self, memory: Memory) -> Sample {
-        let Sample { name, header, missed, restarted, stale, .. } = self;
-        let memory = Arc::new(memory);
-        Sample {
-            name: name.clone(),
-            header: *header,
-            missed: *missed,
-            restarted: *restarted,
-            stale: *stale,
-            memory,
-        }
     }
 }
 

@@ -7,9 +7,8 @@ use std::time::{Duration, Instant};
 use pyo3::prelude::*;
 use pyo3::types::{PyAny, PyDict};
 
-use crate::client::{Confined, Follow, Place, Received, Topics, Verdict, Verdicts};
+use crate::client::{Confined, Follow, Place, Topics, Verdict, Verdicts};
 use crate::error::{Error, value};
-use crate::sample::Sample;
 use crate::{parse, topics};
 
 /// Returns the next item, after a wait if none has arrived. `None` if the subscription is closed.
@@ -41,6 +40,7 @@ fn next<F: Follow<Item: Send> + 'static>(
         notify(py, this, notice)?;
         if item.is_none() {
             py.check_signals()?;
+            warn(py, this)?;
         }
     }
 }
@@ -56,6 +56,9 @@ fn poll<F: Follow>(
     }
     let item = F::try_next(this)?;
     notify(py, this, notice)?;
+    if item.is_none() {
+        warn(py, this)?;
+    }
     Ok(item)
 }
 
@@ -63,6 +66,10 @@ fn notify<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>, notice: Option<&Py
     let Some(call) = notice else { return Ok(()) };
     let notices = this.with(Follow::notices).unwrap_or_default();
     notices.into_iter().try_for_each(|notice| call.call1(py, (notice,)).map(drop))
+}
+
+fn warn<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>) -> PyResult<()> {
+    this.with(Follow::warning).flatten().map_or(Ok(()), |reason| reason.warn(py))
 }
 
 fn is_open<F: Follow>(this: &Arc<Confined<F>>) -> bool {
@@ -83,16 +90,71 @@ fn closed() -> Error {
     Error::new("Failure", "the subscription is closed", "subscribe again")
 }
 
+/// Implements a subscription with the methods that are the same for all of them. `$convert` makes an object of an item.
+macro_rules! follower {
+    ($class:ident, |$py:ident, $item:ident| $convert:expr; $($own:tt)*) => {
+        #[pymethods]
+        impl $class {
+            $($own)*
+
+            fn __iter__(slf: Py<Self>) -> Py<Self> {
+                slf
+            }
+
+            fn __next__(&self, $py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+                let received = next($py, &self.source, self.timeout, self.notice.as_ref())?;
+                received.map(|$item| $convert).transpose()
+            }
+
+            /// Leaves the domain. Samples that the program keeps stay readable.
+            fn close(&self, py: Python<'_>) {
+                py.detach(|| self.source.with(Follow::leave));
+            }
+
+            /// Whether a hub or listener publishes in the domain, as of the last look.
+            #[getter]
+            fn hub_lives(&self) -> bool {
+                self.source.with(|source| source.hub_lives()).unwrap_or_default()
+            }
+
+            #[getter]
+            fn _timeout(&self) -> Option<f64> {
+                self.timeout
+            }
+
+            #[getter]
+            fn _is_open(&self) -> bool {
+                is_open(&self.source)
+            }
+
+            fn _poll(&self, $py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+                let _reserved = self.source.reserve()?;
+                let received = poll($py, &self.source, self.notice.as_ref())?;
+                received.map(|$item| $convert).transpose()
+            }
+
+            fn _descriptor(&self) -> Result<i32, Error> {
+                descriptor(&self.source)
+            }
+
+            fn _silence(&self) -> PyErr {
+                silence(&self.source, self.timeout).into()
+            }
+        }
+    };
+}
+
 /// Subscription to topics. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct Subscription {
-    topics: Arc<Confined<Topics>>,
+    source: Arc<Confined<Topics>>,
     timeout: Option<f64>,
     notice: Option<Py<PyAny>>,
 }
 
-#[pymethods]
-impl Subscription {
+follower! {
+    Subscription, |py, sample| topics::wrap(py, sample);
+
     #[new]
     fn new(
         names: Vec<String>,
@@ -109,69 +171,24 @@ impl Subscription {
             }
         }
         if unique.is_empty() {
-            return Err(
-                Error::new("NoTopic", "no topic is named", "write SENSOR/TOPIC, as front/scan").into()
-            );
+            return Err(Error::new("NoTopic", "no topic is named", "write SENSOR/TOPIC, as front/scan").into());
         }
-        let topics = Arc::new(Confined::new(Topics::new(unique, &Place { domain, root })?));
-        Ok(Subscription { topics, timeout, notice: on_notice })
+        let source = Arc::new(Confined::new(Topics::new(unique, &Place { domain, root })?));
+        Ok(Subscription { source, timeout, notice: on_notice })
     }
-
-    fn __iter__(slf: Py<Self>) -> Py<Self> {
-        slf
-    }
-
-    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
-        wrapped(py, next(py, &self.topics, self.timeout, self.notice.as_ref())?)
-    }
-
-    /// Leaves the domain. Samples that the program keeps stay readable.
-    fn close(&self, py: Python<'_>) {
-        py.detach(|| self.topics.with(Topics::leave));
-    }
-
-    /// Whether a hub or listener publishes in the domain, as of the last look.
-    #[getter]
-    fn hub_lives(&self) -> bool {
-        self.topics.with(|topics| topics.hub_lives()).unwrap_or_default()
-    }
-
-    #[getter]
-    fn _timeout(&self) -> Option<f64> {
-        self.timeout
-    }
-
-    #[getter]
-    fn _is_open(&self) -> bool {
-        is_open(&self.topics)
-    }
-
-    fn _poll(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
-        let _reserved = self.topics.reserve()?;
-        wrapped(py, poll(py, &self.topics, self.notice.as_ref())?)
-    }
-
-    fn _descriptor(&self) -> Result<i32, Error> {
-        descriptor(&self.topics)
-    }
-
-    fn _silence(&self) -> PyErr {
-        silence(&self.topics, self.timeout).into()
-    }
-}
-
-fn wrapped(py: Python<'_>, received: Option<Received>) -> PyResult<Option<Py<PyAny>>> {
-    received.map(|received| topics::wrap(py, Sample::from(received))).transpose()
 }
 
 /// Subscription to the verdict of a robot. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
 pub(crate) struct RobotFollower {
-    verdicts: Arc<Confined<Verdicts>>,
+    source: Arc<Confined<Verdicts>>,
+    timeout: Option<f64>,
+    notice: Option<Py<PyAny>>,
 }
 
-#[pymethods]
-impl RobotFollower {
+follower! {
+    RobotFollower, |py, verdict| robot(py, verdict);
+
     #[new]
     fn new(
         sensors: Vec<String>,
@@ -181,61 +198,21 @@ impl RobotFollower {
     ) -> PyResult<RobotFollower> {
         let sensors: Vec<&str> = sensors.iter().map(String::as_str).collect();
         let verdicts = Verdicts::new(&sensors, &Place { domain, root }, early)?;
-        Ok(RobotFollower { verdicts: Arc::new(Confined::new(verdicts)) })
-    }
-
-    fn __iter__(slf: Py<Self>) -> Py<Self> {
-        slf
-    }
-
-    fn __next__<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
-        next(py, &self.verdicts, None, None)?.map(|verdict| robot(py, verdict)).transpose()
+        Ok(RobotFollower { source: Arc::new(Confined::new(verdicts)), timeout: None, notice: None })
     }
 
     /// Returns what is known now. Never waits.
-    fn now<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let _reserved = self.verdicts.reserve()?;
-        robot(py, self.verdicts.with(Verdicts::now).transpose()?.unwrap_or_default())
-    }
-
-    /// Leaves the domain.
-    fn close(&self, py: Python<'_>) {
-        py.detach(|| drop(self.verdicts.take()));
-    }
-
-    /// Whether a hub or listener publishes in the domain, as of the last look.
-    #[getter]
-    fn hub_lives(&self) -> bool {
-        self.verdicts.with(|verdicts| verdicts.hub_lives()).unwrap_or_default()
-    }
-
-    #[getter]
-    fn _timeout(&self) -> Option<f64> {
-        None
-    }
-
-    #[getter]
-    fn _is_open(&self) -> bool {
-        is_open(&self.verdicts)
-    }
-
-    fn _poll<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
-        let _reserved = self.verdicts.reserve()?;
-        poll(py, &self.verdicts, None)?.map(|verdict| robot(py, verdict)).transpose()
-    }
-
-    fn _descriptor(&self) -> Result<i32, Error> {
-        descriptor(&self.verdicts)
-    }
-
-    fn _silence(&self) -> PyErr {
-        silence(&self.verdicts, None).into()
+    fn now(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let _reserved = self.source.reserve()?;
+        let verdict = self.source.with(Verdicts::now).transpose()?;
+        robot(py, verdict.unwrap_or_default())
     }
 }
 
-fn robot(py: Python<'_>, verdict: Verdict) -> PyResult<Bound<'_, PyAny>> {
+fn robot(py: Python<'_>, verdict: Verdict) -> PyResult<Py<PyAny>> {
     let sensors = PyDict::new(py);
     verdict.sensors.iter().try_for_each(|(sensor, verdict)| sensors.set_item(sensor, verdict))?;
     let (nearest_mm, nearest_sensor) = verdict.nearest.unzip();
-    value(py, "Robot", (verdict.verdict, verdict.worst, nearest_mm, nearest_sensor, sensors))
+    let fields = (verdict.verdict, verdict.worst, nearest_mm, nearest_sensor, sensors);
+    value(py, "Robot", fields).map(Bound::unbind)
 }

@@ -9,6 +9,7 @@ use scanhub_client::{Topic, Verdict};
 use scanhub_schema::{Family, Intensities, Obstacle as FoundObstacle, Telegram as Frame};
 
 use crate::error::value;
+use crate::getters;
 use crate::sample::{Sample, array, fixed, strided, view};
 
 /// Declares the class of each topic.
@@ -62,28 +63,6 @@ classes! {
     Obstacles: Obstacles, |len| len == size_of::<client::Obstacles>();
 }
 
-/// Implements the properties of a class. Each is an expression of Python, the sample and its payload.
-macro_rules! getters {
-    (
-        $class:ident($py:ident, $sample:ident, $payload:ident) = $read:expr;
-        $($(#[$($doc:tt)*])* $name:ident: $type:ty = $value:expr;)*
-    ) => {
-        #[pymethods]
-        impl $class {
-            $(
-                $(#[$($doc)*])*
-                #[getter]
-                #[allow(unused_variables, clippy::extra_unused_lifetimes)]
-                fn $name<'a, 'py>(slf: &'a Bound<'py, Self>) -> $type {
-                    let ($py, $sample) = (slf.py(), slf.as_super().get());
-                    let $payload = $read;
-                    $value
-                }
-            )*
-        }
-    };
-}
-
 /// A numpy array or another object.
 type Object<'py> = PyResult<Bound<'py, PyAny>>;
 /// An object, or None.
@@ -117,11 +96,11 @@ impl From<u32> for Millimeters {
 }
 
 getters! {
-    Telegram(py, sample, frame) = Frame::of(sample.header.family, sample.memory.bytes());
+    Telegram(slf, sample: slf.as_super().get(), frame) = Frame::of(sample.header.family, sample.memory.bytes());
     /// Family of the scanner, such as `lms`; None if this version does not know it.
     family: Option<&'static str> = sample.header.family().map(Family::name);
     /// The bytes: a view.
-    data: Object<'py> = view(py, sample, sample.memory.bytes());
+    data: Object<'py> = view(slf.py(), sample, sample.memory.bytes());
     /// Number of packets; None for an LMS.
     packets: Option<usize> = Some(frame?.packets()?.packets);
     /// Address byte of an LMS; None for other families.
@@ -133,7 +112,7 @@ getters! {
 }
 
 getters! {
-    Scan(py, sample, scan) = client::Scan::of_words(cast_slice(sample.memory.words()));
+    Scan(slf, sample: slf.as_super().get(), scan) = client::Scan::of_words(cast_slice(sample.memory.words()));
     /// Family of the scanner, such as `lms`; None if this version does not know it.
     family: Option<&'static str> = Family::of_number(scan.family).map(Family::name);
     /// Number of beams.
@@ -155,60 +134,60 @@ getters! {
     /// Whether packets of the revolution are missing.
     incomplete: bool = scan.is_incomplete();
     /// Ranges in meters, NaN without a reading: computed.
-    ranges_m: Object<'py> = array(py, (0..scan.beams()).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)).collect());
+    ranges_m: Object<'py> = array(slf.py(), (0..scan.beams()).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)).collect());
     /// Angles of the beams in radians, exact if the scanner reports them: computed.
-    angles: Object<'py> = array(py, (0..scan.beams()).map(|i| scan.angle(i)).collect());
+    angles: Object<'py> = array(slf.py(), (0..scan.beams()).map(|i| scan.angle(i)).collect());
     /// Whether each beam has a reading: computed.
-    valid: Object<'py> = array(py, scan.ranges().iter().map(|range| *range <= scan.valid_to).collect::<Vec<bool>>());
+    valid: Object<'py> = array(slf.py(), scan.ranges().iter().map(|range| *range <= scan.valid_to).collect::<Vec<bool>>());
     /// Index and code of each beam without a reading.
     codes: Vec<(usize, &'static str)> = (0..scan.beams()).filter_map(|i| Some((i, scan.code(i)?.name()))).collect();
     /// Time at which each beam was measured, in ns of `time.monotonic_ns()`: computed.
     times_ns: Object<'py> = {
         let stamp_ns = sample.header.stamp_first_ns as i64;
-        array(py, (0..scan.beams()).map(|i| stamp_ns.wrapping_add(scan.beam_ns(i))).collect())
+        array(slf.py(), (0..scan.beams()).map(|i| stamp_ns.wrapping_add(scan.beam_ns(i))).collect())
     };
     /// Ranges in device units, with codes: a view. Calculate with `ranges_m`.
-    ranges: Object<'py> = view(py, sample, scan.ranges());
+    ranges: Object<'py> = view(slf.py(), sample, scan.ranges());
     /// Exact angles in radians, NaN if nothing was measured: a view. None if the scanner does not report them.
     exact_angles: Maybe<'py> = {
         let has_angles = scan.contents & client::Contents::ANGLES != 0;
-        has_angles.then(|| view(py, sample, scan.exact_angles())).transpose()
+        has_angles.then(|| view(slf.py(), sample, scan.exact_angles())).transpose()
     };
     /// Intensities of the beams, one or two bytes: a view. None if the scanner does not send them.
     intensities: Maybe<'py> = {
         let intensities = || match scan.intensities() {
-            Intensities::Narrow(bytes) => view(py, sample, bytes),
-            Intensities::Wide(words) => view(py, sample, words),
+            Intensities::Narrow(bytes) => view(slf.py(), sample, bytes),
+            Intensities::Wide(words) => view(slf.py(), sample, words),
         };
         (scan.intensity_bits != 0).then(intensities).transpose()
     };
     /// Bytes next to the ranges, intensities or field bits: a view. None if the scanner does not send them.
     upper: Maybe<'py> = {
         let has_upper = scan.contents & client::Contents::UPPER != 0;
-        has_upper.then(|| view(py, sample, scan.upper())).transpose()
+        has_upper.then(|| view(slf.py(), sample, scan.upper())).transpose()
     };
 }
 
 getters! {
-    Marks(py, sample, marks) = fixed::<client::Marks>(sample);
+    Marks(slf, sample: slf.as_super().get(), marks) = fixed::<client::Marks>(sample);
     /// Whether the measuring mode has marks. Otherwise, the list is always empty.
     available: bool = marks.is_available();
     /// Whether there were more marks than fit.
     overflow: bool = marks.is_overflow();
     /// The marks in the order of their beams.
     marks: List<'py> = {
-        values(py, marks.marks().iter(), |mark| {
+        values(slf.py(), marks.marks().iter(), |mark| {
             let (angle_deg, range_mm) =
                 (f64::from(mark.angle_mdeg) / 1000.0, f64::from(mark.range_dmm) / 10.0);
             let beams = (mark.first_beam, mark.last_beam);
             let is_edge = mark.edge != 0;
-            value(py, "Mark", (angle_deg, range_mm, mark.peak, mark.weight, beams.0, beams.1, is_edge))
+            value(slf.py(), "Mark", (angle_deg, range_mm, mark.peak, mark.weight, beams.0, beams.1, is_edge))
         })
     };
 }
 
 getters! {
-    Lines(py, sample, lines) = fixed::<client::Lines>(sample);
+    Lines(slf, sample: slf.as_super().get(), lines) = fixed::<client::Lines>(sample);
     /// Whether there were more lines than fit.
     overflow: bool = lines.is_overflow();
     /// Number of beams of the scan that have a reading.
@@ -219,7 +198,7 @@ getters! {
     noise_m: f32 = lines.noise_m;
     /// The lines in the order of their beams.
     lines: List<'py> = {
-        values(py, lines.lines().iter(), |line| {
+        values(slf.py(), lines.lines().iter(), |line| {
             let ends = (line.x1_m, line.y1_m, line.x2_m, line.y2_m);
             let normal = (line.r_m, line.alpha_rad, line.sd_r_m, line.sd_alpha_rad);
             let (x1_m, y1_m, x2_m, y2_m) = ends;
@@ -227,14 +206,14 @@ getters! {
             let beams = (line.first, line.last, line.points);
             let fields =
                 (x1_m, y1_m, x2_m, y2_m, r_m, alpha_rad, sd_r_m, sd_alpha_rad, beams.0, beams.1, beams.2);
-            value(py, "Line", fields)
+            value(slf.py(), "Line", fields)
         })
     };
     /// Intersections of lines.
     corners: List<'py> = {
-        values(py, lines.corners().iter(), |corner| {
+        values(slf.py(), lines.corners().iter(), |corner| {
             let fields = (corner.x_m, corner.y_m, corner.first_line, corner.second_line);
-            value(py, "Corner", fields)
+            value(slf.py(), "Corner", fields)
         })
     };
 }
@@ -245,25 +224,25 @@ fn matrix<'py>(py: Python<'py>, elements: &[f32; 9]) -> PyResult<Bound<'py, PyAn
 }
 
 getters! {
-    Motion(py, sample, motion) = fixed::<client::Motion>(sample);
+    Motion(slf, sample: slf.as_super().get(), motion) = fixed::<client::Motion>(sample);
     /// Method by which the step was found: `first`, `refused`, `beams`, `points`, `lines` or `both`.
     method: &'static str = motion.how().name();
     /// Step from the previous scan; None if there is none.
     step: Maybe<'py> = {
         let fields = (motion.dx_m, motion.dy_m, motion.dyaw_rad);
-        motion.has_step().then(|| value(py, "Step", fields)).transpose()
+        motion.has_step().then(|| value(slf.py(), "Step", fields)).transpose()
     };
     /// Covariance of the step, 3 x 3; None if there is none.
-    covariance: Maybe<'py> = motion.has_step().then(|| matrix(py, &motion.covariance)).transpose();
+    covariance: Maybe<'py> = motion.has_step().then(|| matrix(slf.py(), &motion.covariance)).transpose();
     /// Share of the readings that are on surfaces of the previous scan; None if there is no step.
     overlap: Option<f32> = Some(motion.overlap).filter(|_| motion.has_step());
     /// Sum of all steps; None if it is unknown.
     place: Maybe<'py> = {
         let fields = (motion.x_m, motion.y_m, motion.yaw_rad);
-        motion.has_pose().then(|| value(py, "Place", fields)).transpose()
+        motion.has_pose().then(|| value(slf.py(), "Place", fields)).transpose()
     };
     /// Covariance of `place`, 3 x 3; None if it is unknown.
-    pose_covariance: Maybe<'py> = motion.sum_covariance().map(|covariance| matrix(py, covariance)).transpose();
+    pose_covariance: Maybe<'py> = motion.sum_covariance().map(|covariance| matrix(slf.py(), covariance)).transpose();
     /// Whether `place` is known, and contains no degenerate step.
     valid: bool = motion.has_valid_pose();
     /// Whether the surroundings leave a direction open, as a corridor does.
@@ -273,7 +252,7 @@ getters! {
 }
 
 getters! {
-    Early(py, sample, early) = fixed::<client::Early>(sample);
+    Early(slf, sample: slf.as_super().get(), early) = fixed::<client::Early>(sample);
     /// `slow` or `stop`.
     verdict: &'static str = early.verdict().name();
     /// Whether the warning with this number is withdrawn.
@@ -289,7 +268,7 @@ getters! {
 }
 
 getters! {
-    Zones(py, sample, zones) = fixed::<client::Zones>(sample);
+    Zones(slf, sample: slf.as_super().get(), zones) = fixed::<client::Zones>(sample);
     /// Whether the verdict is unknown because no recent data arrived.
     stale: bool = sample.stale;
     /// `clear`, `slow`, `stop` or `unknown`. Treat `unknown` as `stop`.
@@ -299,8 +278,8 @@ getters! {
     /// Distance of this point from the center in mm; None if there is none.
     nearest_mm: Option<u32> = Some(zones.nearest()?.1);
     /// The zones, the largest first.
-    zones: List<'py> = values(py, zones.zones().iter(), |zone| {
-            value(py, "Zone", (zone.radius_mm, zone.violated == 1, zone.beams))
+    zones: List<'py> = values(slf.py(), zones.zones().iter(), |zone| {
+            value(slf.py(), "Zone", (zone.radius_mm, zone.violated == 1, zone.beams))
         });
     /// Number of beams without a reading that see into the largest zone.
     invalid_beams: u16 = zones.invalid_beams;
@@ -309,7 +288,7 @@ getters! {
 }
 
 getters! {
-    Foreground(py, sample, foreground) = client::Foreground::of_words(cast_slice(sample.memory.words()));
+    Foreground(slf, sample: slf.as_super().get(), foreground) = client::Foreground::of_words(cast_slice(sample.memory.words()));
     /// Generation of the background that the scan was compared with.
     generation: u32 = foreground.generation;
     /// Number of beams of the scan.
@@ -317,18 +296,18 @@ getters! {
     /// Millimeters per device unit.
     unit_mm: Millimeters = foreground.unit_um.into();
     /// Indexes of the foreground beams: computed.
-    beams: Object<'py> = array(py, foreground.readings().map(|(i, _)| i as i64).collect());
+    beams: Object<'py> = array(slf.py(), foreground.readings().map(|(i, _)| i as i64).collect());
     /// Ranges of the foreground beams in device units: a view.
-    ranges: Object<'py> = view(py, sample, foreground.ranges());
+    ranges: Object<'py> = view(slf.py(), sample, foreground.ranges());
     /// The segments in the order of their beams.
     segments: List<'py> = {
         let in_mm = |units: u16| u64::from(units) * u64::from(foreground.unit_um) / 1000;
-        values(py, foreground.segments().iter().enumerate(), |(i, segment)| {
+        values(slf.py(), foreground.segments().iter().enumerate(), |(i, segment)| {
             let (nearest_mm, width_mm) = (in_mm(segment.nearest), in_mm(segment.width));
             let (first, last) = (segment.first, segment.last);
             let has_support = foreground.has_support(i);
             let fields = (first, last, nearest_mm, width_mm, segment.x_mm, segment.y_mm, has_support);
-            value(py, "Segment", fields)
+            value(slf.py(), "Segment", fields)
         })
     };
     /// Number of segments that did not fit.
@@ -336,7 +315,7 @@ getters! {
 }
 
 getters! {
-    Background(py, sample, background) = client::Background::of_words(cast_slice(sample.memory.words()));
+    Background(slf, sample: slf.as_super().get(), background) = client::Background::of_words(cast_slice(sample.memory.words()));
     /// Number of the model. It increases by 1 after a reset, a load, and a change of the beams or the unit.
     generation: u32 = background.generation;
     /// Number of beams whose background is known.
@@ -348,7 +327,7 @@ getters! {
     /// Whether learning is stopped.
     frozen: bool = background.is_frozen();
     /// Ranges in device units, 0 if unknown, 65535 if beyond the maximum range: a view.
-    ranges: Object<'py> = view(py, sample, background.ranges());
+    ranges: Object<'py> = view(slf.py(), sample, background.ranges());
     /// Ranges in meters, NaN if unknown, infinite if beyond the maximum range: computed.
     ranges_m: Object<'py> = {
         let in_m = |range: &u16| match *range {
@@ -356,7 +335,7 @@ getters! {
             client::Background::FAR => f64::INFINITY,
             range => f64::from(range) * f64::from(background.unit_um) / 1e6,
         };
-        array(py, background.ranges().iter().map(in_m).collect::<Vec<f64>>())
+        array(slf.py(), background.ranges().iter().map(in_m).collect::<Vec<f64>>())
     };
     /// Angle of beam 0 in radians; None before the first scan.
     first_angle: Option<f64> = Some(background.first_angle).filter(|_| background.step != 0.0);
@@ -365,13 +344,13 @@ getters! {
     /// Angles of the beams in radians: computed. None before the first scan.
     angles: Maybe<'py> = {
         let angle = |i: usize| background.first_angle + i as f64 * background.step;
-        let angles = || array(py, (0..background.ranges().len()).map(angle).collect::<Vec<f64>>());
+        let angles = || array(slf.py(), (0..background.ranges().len()).map(angle).collect::<Vec<f64>>());
         (background.step != 0.0).then(angles).transpose()
     };
 }
 
 getters! {
-    Status(py, sample, status) = fixed::<client::Status>(sample);
+    Status(slf, sample: slf.as_super().get(), status) = fixed::<client::Status>(sample);
     /// `absent`, `probing`, `switching`, `starting`, `streaming`, `silent` or `paused`.
     state: &'static str = status.state().map_or("unknown", client::State::name);
     /// Stamp of the start of the state, in ns of `time.monotonic_ns()`.
@@ -400,7 +379,7 @@ getters! {
     last_error: &'a str = status.last_error();
     /// Counters by their names in docs/output.md.
     counters: PyResult<Bound<'py, PyDict>> = {
-        let counters = PyDict::new(py);
+        let counters = PyDict::new(slf.py());
         status.counters.named().try_for_each(|(name, count)| counters.set_item(name, count))?;
         Ok(counters)
     };
@@ -411,23 +390,23 @@ getters! {
     /// Pose of the sensor, as configured.
     pose: Object<'py> = {
         let pose = &status.pose;
-        value(py, "Pose", (pose.x_m, pose.y_m, pose.yaw_rad, pose.upside_down == 1))
+        value(slf.py(), "Pose", (pose.x_m, pose.y_m, pose.yaw_rad, pose.upside_down == 1))
     };
 }
 
 getters! {
-    Tracks(py, sample, tracks) = fixed::<client::Tracks>(sample);
+    Tracks(slf, sample: slf.as_super().get(), tracks) = fixed::<client::Tracks>(sample);
     /// The sensors in the order of the site.
     sites: List<'py> = {
-        values(py, tracks.sensors().iter(), |site| {
+        values(slf.py(), tracks.sensors().iter(), |site| {
             let fields = (site.name(), site.x_m, site.y_m, site.yaw_rad, site.upside_down == 1);
-            value(py, "Site", fields)
+            value(slf.py(), "Site", fields)
         })
     };
     /// The tracks in the order of their IDs.
     tracks: List<'py> = {
-        values(py, tracks.tracks().iter(), |track| {
-            let sensors = PyTuple::new(py, tracks.seen_by(track).collect::<Vec<_>>())?;
+        values(slf.py(), tracks.tracks().iter(), |track| {
+            let sensors = PyTuple::new(slf.py(), tracks.seen_by(track).collect::<Vec<_>>())?;
             let (position, speed) = ((track.x_m, track.y_m), (track.vx_m_s, track.vy_m_s));
             let [xx, xy, yy] = track.covariance;
             let fields = (
@@ -443,13 +422,13 @@ getters! {
                 f64::from(track.age_ms) / 1000.0,
                 track.score,
             );
-            value(py, "Track", fields)
+            value(slf.py(), "Track", fields)
         })
     };
 }
 
 getters! {
-    Event(py, sample, event) = fixed::<client::Event>(sample);
+    Event(slf, sample: slf.as_super().get(), event) = fixed::<client::Event>(sample);
     /// `appeared`, `left` or `door`; None if this version does not know it.
     kind: Option<&'static str> = event.kind().map(|kind| kind.name());
     /// ID of the track.
@@ -465,7 +444,7 @@ getters! {
 }
 
 getters! {
-    Tilt(py, sample, tilt) = fixed::<client::Tilt>(sample);
+    Tilt(slf, sample: slf.as_super().get(), tilt) = fixed::<client::Tilt>(sample);
     /// Angle in radians, right-handed around the mount's axis.
     angle_rad: f64 = tilt.angle_rad;
     /// Angular rate in radians per second; None if unknown.
@@ -476,7 +455,7 @@ getters! {
 const POINT: usize = size_of::<client::CloudPoint>();
 
 getters! {
-    Cloud(py, sample, cloud) = client::Cloud::of_words(cast_slice(sample.memory.words()));
+    Cloud(slf, sample: slf.as_super().get(), cloud) = client::Cloud::of_words(cast_slice(sample.memory.words()));
     /// Number of the sweep, from 0.
     sweep: u32 = cloud.sweep;
     /// Generation of the background. Each reset increases it by 1.
@@ -494,12 +473,12 @@ getters! {
     /// Rows of x, y and z in the robot's frame, in meters: a view.
     points: Object<'py> = {
         let points = cloud.points();
-        strided(py, sample, points, "<f4", vec![points.len(), 3], Some(vec![POINT, 4]))
+        strided(slf.py(), sample, points, "<f4", vec![points.len(), 3], Some(vec![POINT, 4]))
     };
     /// Index of each point's beam in the scan: a view.
-    beams: Object<'py> = part_of_points(py, sample, cloud.points(), std::mem::offset_of!(client::CloudPoint, beam), "<u2");
+    beams: Object<'py> = part_of_points(slf.py(), sample, cloud.points(), std::mem::offset_of!(client::CloudPoint, beam), "<u2");
     /// Class of each point, an index in `scanhub.CLASSES`: a view.
-    classes: Object<'py> = part_of_points(py, sample, cloud.points(), std::mem::offset_of!(client::CloudPoint, point_class), "|u1");
+    classes: Object<'py> = part_of_points(slf.py(), sample, cloud.points(), std::mem::offset_of!(client::CloudPoint, point_class), "|u1");
 }
 
 /// Returns a view of the field at `offset` of all points.
@@ -516,7 +495,7 @@ fn part_of_points<'py>(
 }
 
 getters! {
-    Obstacles(py, sample, obstacles) = fixed::<client::Obstacles>(sample);
+    Obstacles(slf, sample: slf.as_super().get(), obstacles) = fixed::<client::Obstacles>(sample);
     /// Number of the sweep, from 0.
     sweep: u32 = obstacles.sweep;
     /// Generation of the background. Each reset increases it by 1.
@@ -529,14 +508,14 @@ getters! {
     left_out: u32 = obstacles.left_out;
     /// The obstacles, the nearest first.
     obstacles: List<'py> = {
-        values(py, obstacles.obstacles().iter(), |obstacle| {
+        values(slf.py(), obstacles.obstacles().iter(), |obstacle| {
             let [x_m, y_m, z_m] = obstacle.middle;
             let (low, high) = (<(f32, f32, f32)>::from(obstacle.low), <(f32, f32, f32)>::from(obstacle.high));
             let (distance_m, points) = (obstacle.distance_m, obstacle.points);
             let is_foreground = obstacle.has(FoundObstacle::FOREGROUND);
             let is_near = obstacle.has(FoundObstacle::NEAR);
             let fields = (x_m, y_m, z_m, low, high, distance_m, points, is_foreground, is_near);
-            value(py, "Obstacle", fields)
+            value(slf.py(), "Obstacle", fields)
         })
     };
 }

@@ -6,6 +6,7 @@ import resource
 import struct
 import sys
 import time
+import warnings
 
 import scanhub
 
@@ -82,6 +83,22 @@ def silence() -> None:
     os.close(lock)
 
 
+def reasons_of_a_silence() -> None:
+    lock = hub_without_topics()
+    for topic, other_domain in (("othr/tilt", domain), ("front/scan", "nowhere")):
+        with publish("other"), warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            silent = scanhub.subscribe(topic, domain=other_domain, root=root, timeout=4)
+            begin = time.monotonic()
+            refusal(scanhub.Failure, lambda: next(silent))
+            assert time.monotonic() - begin >= 4
+        (warning,) = caught
+        assert warning.category is scanhub.SilenceWarning and warning.filename == __file__, warning
+        said = str(warning.message)
+        assert ("othr/tilt" in said and "other/tilt" in said) if other_domain == domain else "scanhub run" in said, said
+    os.close(lock)
+
+
 def what_is_short() -> None:
     lock = hub_without_topics()
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -112,6 +129,6 @@ def a_taken_name() -> None:
 
 domain, root = sys.argv[1:]
 place = os.path.join(root, domain)
-for check in (names_that_are_none, no_hub, somebody_elses_domain, a_taken_name, silence, what_is_short):
+for check in (names_that_are_none, no_hub, somebody_elses_domain, a_taken_name, silence, reasons_of_a_silence, what_is_short):
     check()
     print(check.__name__, flush=True)

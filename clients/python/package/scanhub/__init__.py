@@ -40,7 +40,7 @@ from ._scanhub import (
     __commit__ as __commit__,
     __version__ as __version__,
 )
-from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent, Taken
+from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, SilenceWarning, Silent, Taken
 from .values import (
     CLASSES,
     Corner,
@@ -91,6 +91,7 @@ __all__ = [
     "Segment",
     "Short",
     "Shown",
+    "SilenceWarning",
     "Silent",
     "Site",
     "Status",

@@ -15,6 +15,10 @@ class Failure(Exception):
         return f"{self.message}\n  {self.remedy}" if self.remedy else self.message
 
 
+class SilenceWarning(UserWarning):
+    """Nothing was received for two seconds after the start, because there is no hub or a topic is missing."""
+
+
 class NoHub(Failure):
     """No hub lives in the domain, or it went away before it answered."""
 
