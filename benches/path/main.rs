@@ -18,7 +18,7 @@
 //! CARGO_PROFILE_BENCH_STRIP=none CARGO_PROFILE_RELEASE_STRIP=none cargo bench --bench path
 //! ```
 //!
-//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.ld`. Entries for
+//! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.lds`. Entries for
 //! functions that no longer exist do no harm, so write it again only if the path has changed much.
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
 
@@ -279,7 +279,7 @@ mod on_x86_64 {
 
     const SENSOR: &str = "front";
     /// The linker script that `build.rs` passes to the linker, and its first lines.
-    const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.ld");
+    const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.lds");
     const ABOUT: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
         status. Written by the bench `path`. */\n";
     /// Time between two telegrams at 9,600 baud.

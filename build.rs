@@ -1,0 +1,15 @@
+//! Links the program with the functions that run for each telegram next to each other, so that they fill fewer pages.
+
+use std::env;
+
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-changed=hub/path.lds");
+    let variable = |name| env::var(name).unwrap_or_default();
+    // The linkers of GNU and LLVM understand the script. Other linkers are only used if they are configured.
+    let linker = variable("RUSTC_LINKER") + &variable("CARGO_ENCODED_RUSTFLAGS");
+    let is_other = ["mold", "gold", "wild"].iter().any(|name| linker.contains(name));
+    if variable("CARGO_CFG_TARGET_OS") == "linux" && variable("PROFILE") == "release" && !is_other {
+        println!("cargo::rustc-link-arg-bins=-Wl,-T,{}/hub/path.lds", variable("CARGO_MANIFEST_DIR"));
+    }
+}
