@@ -115,11 +115,14 @@ impl OfSensor {
             broken.push(format!("listeners got no event after {unheard}, before {topic:?} of {seq}"));
         }
         let is_of_scan = sample.header.hub_time_ns().is_some();
-        if topic == Topic::Zones && is_of_scan && self.scan != Some(seq) {
-            broken.extend(self.absent(&AFTER_ZONES, self.scan));
-            broken.extend(self.absent(&[Topic::Scan], Some(seq)));
-            self.scan = Some(seq);
-            self.lacking.clear();
+        if topic == Topic::Zones && self.scan != Some(seq) {
+            if is_of_scan {
+                broken.extend(self.absent(&AFTER_ZONES, self.scan));
+                broken.extend(self.absent(&[Topic::Scan], Some(seq)));
+                self.lacking.clear();
+            }
+            // A scan that waited too long has no time of the hub, either.
+            self.scan = is_of_scan.then_some(seq);
         }
         self.published.insert(topic, seq);
         if topic != Topic::Early {
