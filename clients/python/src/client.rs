@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, Who, find};
+use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, find};
 use scanhub_client::{
     Domain, Environment, ErrorKind, Header, Pollable, Publication, Robot, RobotSubscriber, SubscriberBuilder,
     Tilt, Topic, Wait,
@@ -247,8 +247,8 @@ impl Topics {
                 return Ok(Some(received));
             }
             let Change { gone, back } = self.session.look()?;
-            self.notices.extend(gone.filter(|who| *who == Who::Hub).map(|_| "hub_gone"));
-            self.notices.extend(back.filter(|who| *who == Who::Hub).map(|_| "hub_back"));
+            self.notices.extend(gone.map(|_| "hub_gone"));
+            self.notices.extend(back.map(|_| "hub_back"));
             if self.session.domain().is_none()
                 && let Some(denied) = Error::denied(self.session.no_hub_here())
             {
