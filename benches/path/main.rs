@@ -278,7 +278,7 @@ mod on_x86_64 {
     }
 
     const SENSOR: &str = "front";
-    /// The linker script that `build.rs` passes to the linker, and its first lines.
+    /// The linker script that `hub/build.rs` passes to the linker, and its first lines.
     const LINK_ORDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/hub/path.lds");
     const ABOUT: &str = "/* The functions that run for each telegram, in the order in which they run, and then those of the\n   \
         status. Written by the bench `path`. */\n";

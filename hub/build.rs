@@ -3,7 +3,7 @@
 use std::env;
 
 fn main() {
-    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-changed=hub/build.rs");
     println!("cargo::rerun-if-changed=hub/path.lds");
     let variable = |name| env::var(name).unwrap_or_default();
     // The linkers of GNU and LLVM understand the script. Other linkers are only used if they are configured.
