@@ -178,8 +178,8 @@ impl Handle {
         Ok(Handle::of(Source::open(domain, sensor, topic, wait)?))
     }
 
-    /// Follows the robot of `sensors` (if empty: all) in `domain`, as [`open`](Self::open) does, with or without `early`
-    /// warnings.
+    /// Follows the robot of `sensors` (if empty: all) in `domain`, as [`open`](Self::open) does, with or without
+    /// `early` warnings.
     pub(crate) fn open_robot(
         domain: Option<&str>,
         sensors: &[&str],
@@ -254,7 +254,7 @@ impl Handle {
         Ok(self.source.descriptor()?)
     }
 
-    /// As [`Subscriber::hub_is_running`].
+    /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`] does.
     pub(crate) fn hub_lives(&mut self) -> bool {
         self.source.hub_lives()
     }

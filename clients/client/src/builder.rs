@@ -124,7 +124,8 @@ impl<P: Payload + ?Sized> SubscriberBuilder<Subscriber<P>> {
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
     pub fn open_pollable(self) -> Result<PollableSubscriber<P>, Error> {
         let mut session = self.session()?;
         let descriptor = session.pollable()?;
@@ -152,7 +153,8 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> SubscriberBuilder<JoinedSubscribe
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
     pub fn open_pollable(self) -> Result<Pollable<JoinedSubscriber<A, B>>, Error> {
         let mut session = self.session()?;
         let descriptor = session.pollable()?;
@@ -175,7 +177,8 @@ impl SubscriberBuilder<ZonesSubscriber> {
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
     pub fn open_pollable(self) -> Result<Pollable<ZonesSubscriber>, Error> {
         let mut session = self.session()?;
         let descriptor = session.pollable()?;
@@ -204,7 +207,8 @@ impl SubscriberBuilder<RobotSubscriber> {
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open); [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors have run out.
+    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
     pub fn open_pollable(self) -> Result<Pollable<RobotSubscriber>, Error> {
         let mut session = self.session()?;
         let descriptor = session.pollable()?;

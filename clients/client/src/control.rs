@@ -31,10 +31,12 @@ use crate::presence::{GRACE, find};
 ///
 /// # Errors
 ///
-/// [`ErrorKind::NoHub`](crate::ErrorKind) within a second if there is none, or if it ends before it answers; [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors
-/// that exist; [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time; [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it;
-/// [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not answer: it is short of something, or the link is busy;
-/// [`ErrorKind::Interrupted`](crate::ErrorKind) if `stop` is set.
+/// [`ErrorKind::NoHub`](crate::ErrorKind) within a second if there is none, or if it ends before it answers;
+/// [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors that exist;
+/// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time;
+/// [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it; [`ErrorKind::Timeout`](crate::ErrorKind) if the
+/// hub does not answer: it is short of something, or the link is busy; [`ErrorKind::Interrupted`](crate::ErrorKind) if
+/// `stop` is set.
 pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Error> {
     let domain = find(places)?;
     let node = scanhub_shm::client_node(&domain)?;

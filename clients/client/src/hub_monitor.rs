@@ -1,7 +1,7 @@
 //! Makes a descriptor readable when a hub starts or ends, so that a program that polls it needs no timer.
 //!
-//! Without a hub, inotify reports changes in the directories in which a hub creates its files. A directory that does not
-//! exist yet is watched for in the nearest one that exists. With a hub, a pidfd reports the end of its process.
+//! Without a hub, inotify reports changes in the directories in which a hub creates its files. A directory that does
+//! not exist yet is watched for in the nearest one that exists. With a hub, a pidfd reports the end of its process.
 
 use std::ffi::{OsStr, OsString};
 use std::mem::MaybeUninit;

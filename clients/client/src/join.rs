@@ -1,5 +1,5 @@
-//! Joins the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They arrive
-//! one after the other, and either one may be missing.
+//! Joins the samples of two topics that a hub computes from the same telegram, such as `scan` and `foreground`. They
+//! arrive one after the other, and either one may be missing.
 
 use std::collections::VecDeque;
 
@@ -7,8 +7,8 @@ use scanhub_schema::Header;
 
 /// Pairs of samples with the same `boot` and `seq`, from two topics of one sensor. Time is an argument.
 ///
-/// A sample waits for its partner until the partner's topic sends a later one, so for one period. If that topic is silent, it
-/// waits for 1 s.
+/// A sample waits for its partner until the partner's topic sends a later one, so for one period. If that topic is
+/// silent, it waits for 1 s.
 ///
 /// # Examples
 ///
@@ -50,7 +50,8 @@ impl<A, B> Default for Join<A, B> {
 }
 
 impl<A, B> Join<A, B> {
-    /// Takes a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has arrived.
+    /// Takes a sample of the first topic that was received at `now_ns`. Returns it with its partner if that has
+    /// arrived.
     pub fn first(&mut self, header: &Header, sample: A, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.second, header, &mut self.dropped) {
             Some(partner) => Some((sample, partner)),
@@ -61,7 +62,8 @@ impl<A, B> Join<A, B> {
         }
     }
 
-    /// Takes a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has arrived.
+    /// Takes a sample of the second topic that was received at `now_ns`. Returns it with its partner if that has
+    /// arrived.
     pub fn second(&mut self, header: &Header, sample: B, now_ns: u64) -> Option<(A, B)> {
         match partner(&mut self.first, header, &mut self.dropped) {
             Some(partner) => Some((partner, sample)),
@@ -72,8 +74,8 @@ impl<A, B> Join<A, B> {
         }
     }
 
-    /// Drops the samples whose partner's topic is silent. Call it when all samples that have arrived were taken: after a pause
-    /// of the program, a partner may be among them.
+    /// Drops the samples whose partner's topic is silent. Call it when all samples that have arrived were taken: after
+    /// a pause of the program, a partner may be among them.
     pub fn expire(&mut self, now_ns: u64) {
         self.dropped += expire(&mut self.first, now_ns) + expire(&mut self.second, now_ns);
     }
@@ -84,8 +86,8 @@ impl<A, B> Join<A, B> {
     }
 }
 
-/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it: the topics are in order,
-/// so the partners of these are lost.
+/// Removes the partner of the sample with this header from `waiting`, and drops the samples before it: the topics are
+/// in order, so the partners of these are lost.
 fn partner<T>(waiting: &mut VecDeque<Waiting<T>>, header: &Header, dropped: &mut u64) -> Option<T> {
     let is_earlier = |one: &&Waiting<T>| one.boot == header.boot && one.seq < header.seq;
     let found = waiting.iter().position(|one| (one.boot, one.seq) == (header.boot, header.seq));

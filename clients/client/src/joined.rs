@@ -15,8 +15,8 @@ use crate::follower::{Follower, Received};
 use crate::session::Session;
 use crate::silence::{Silence, SilenceCheck};
 
-/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples come
-/// in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
+/// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples
+/// come in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
 ///
 /// # Examples
 ///
@@ -48,8 +48,8 @@ pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
     pub first: Received<A>,
     /// The sample of the second topic.
     pub second: Received<B>,
-    /// Pairs between the last one and this one that were not received whole: one or both samples were missed, or one was
-    /// never sent. 0 for the first pair.
+    /// Pairs between the last one and this one that were not received whole: one or both samples were missed, or one
+    /// was never sent. 0 for the first pair.
     pub missed: u64,
     /// Whether the hub was restarted since the last pair.
     pub restarted: bool,
@@ -66,7 +66,7 @@ pub struct JoinedSubscriber<A: Payload + ?Sized, B: Payload + ?Sized> {
     silence: SilenceCheck,
 }
 
-/// One of the two topics.
+/// State of one of the two topics.
 struct Side<P: Payload + ?Sized> {
     follower: Follower<P>,
     /// Sample without a partner, and CLOCK_MONOTONIC in ns until which it waits.
@@ -101,7 +101,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
     ///
     /// # Errors
     ///
-    /// As [`Subscriber::next`](crate::Subscriber::next).
+    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next).
     #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
     pub fn next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
         let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
@@ -117,8 +117,8 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
         }
     }
 
-    /// Returns an iterator over the pairs, which waits for each of them. It ends after a silence of the timeout; a later
-    /// call continues.
+    /// Returns an iterator over the pairs, which waits for each of them. It ends after a silence of the timeout; a
+    /// later call continues.
     pub fn iter(&mut self) -> impl Iterator<Item = Result<Joined<A, B>, Error>> + '_ {
         std::iter::from_fn(|| self.next().transpose())
     }
@@ -127,7 +127,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
     ///
     /// # Errors
     ///
-    /// As [`next`](Self::next).
+    /// Returns the errors of [`next`](Self::next).
     pub fn try_next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
         loop {
             if let Some(pair) = self.look()? {
@@ -150,7 +150,8 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
         self.session.wait_for(Some(self.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// As [`Subscriber::hub_is_running`](crate::Subscriber::hub_is_running).
+    /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`](crate::Subscriber::hub_is_running)
+    /// does.
     pub fn hub_is_running(&self) -> bool {
         self.session.domain().is_some()
     }
@@ -189,7 +190,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
             let is_first_earlier = match (self.first.header(), self.second.header()) {
                 (Some(a), Some(b)) if (a.boot, a.seq) == (b.boot, b.seq) => return Ok(self.pair()),
                 (Some(a), Some(b)) if a.boot == b.boot => a.seq < b.seq,
-                // Of two runs of the hub, the earlier one has ended.
+                // The earlier run of the hub has ended.
                 (Some(a), Some(b)) => a.stamp_last_ns < b.stamp_last_ns,
                 (Some(_), None) if self.first.is_overdue() => true,
                 (None, Some(_)) if self.second.is_overdue() => false,

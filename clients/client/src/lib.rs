@@ -6,8 +6,8 @@
 //! - [`joined`] subscribes to two topics, and returns the samples of one telegram in pairs.
 //! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
 //!   [`Verdict::Unknown`].
-//! - `SubscriberBuilder::open_pollable` returns a subscriber with a descriptor for `poll` or an executor. With the feature
-//!   `tokio`, it is a stream.
+//! - `SubscriberBuilder::open_pollable` returns a subscriber with a descriptor for `poll` or an executor. With the
+//!   feature `tokio`, it is a stream.
 //! - [`publish`] creates a topic for other programs.
 //! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
 //! - [`streams`] is for programs that follow many topics in one thread.

@@ -44,9 +44,10 @@ pub type PollableSubscriber<P> = Pollable<Subscriber<P>>;
 /// Subscriber with a descriptor that is readable while there may be something to take. Poll it, never read it. While it
 /// is readable, `poll` returns at once, until `try_next` returns `None`.
 ///
-/// It can be readable although nothing has arrived: once a second while a hub runs, when another topic of the sensor has
-/// a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. The descriptor stays the same for the subscriber's life, even if the hub restarts, and a
-/// program that the process starts does not inherit it. With the feature `tokio`, the subscriber is a `Stream`.
+/// It can be readable although nothing has arrived: once a second while a hub runs, when another topic of the sensor
+/// has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. The descriptor
+/// stays the same for the subscriber's life, even if the hub restarts, and a program that the process starts does not
+/// inherit it. With the feature `tokio`, the subscriber is a `Stream`.
 pub struct Pollable<T> {
     descriptor: Arc<OwnedFd>,
     // A lock, so that `try_next` works while an executor borrows the descriptor.
@@ -104,22 +105,22 @@ impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
     ///
     /// # Errors
     ///
-    /// As [`Subscriber::next`].
+    /// Returns the errors of [`Subscriber::next`].
     pub fn try_next(&self) -> Result<Option<Received<P>>, Error> {
         self.locked().try_next()
     }
 
-    /// As [`Subscriber::hub_is_running`].
+    /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`] does.
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
 
-    /// As [`Subscriber::why_silent`].
+    /// Returns why nothing arrives, as [`Subscriber::why_silent`] does.
     pub fn why_silent(&self) -> Silence {
         self.locked().why_silent()
     }
 
-    /// As [`Subscriber::silent_for`].
+    /// Returns the duration of the silence, as [`Subscriber::silent_for`] does.
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }
@@ -130,22 +131,22 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> Pollable<JoinedSubscriber<A, B>> 
     ///
     /// # Errors
     ///
-    /// As [`JoinedSubscriber::next`].
+    /// Returns the errors of [`JoinedSubscriber::next`].
     pub fn try_next(&self) -> Result<Option<Joined<A, B>>, Error> {
         self.locked().try_next()
     }
 
-    /// As [`JoinedSubscriber::hub_is_running`].
+    /// Returns whether a hub runs in the domain, as [`JoinedSubscriber::hub_is_running`] does.
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
 
-    /// As [`JoinedSubscriber::why_silent`].
+    /// Returns why nothing arrives, as [`JoinedSubscriber::why_silent`] does.
     pub fn why_silent(&self) -> Silence {
         self.locked().why_silent()
     }
 
-    /// As [`JoinedSubscriber::silent_for`].
+    /// Returns the duration of the silence, as [`JoinedSubscriber::silent_for`] does.
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }
@@ -157,22 +158,22 @@ impl Pollable<ZonesSubscriber> {
     ///
     /// # Errors
     ///
-    /// As [`ZonesSubscriber::next`].
+    /// Returns the errors of [`ZonesSubscriber::next`].
     pub fn try_next(&self) -> Result<Option<Heard>, Error> {
         self.locked().try_next()
     }
 
-    /// As [`ZonesSubscriber::hub_is_running`].
+    /// Returns whether a hub runs in the domain, as [`ZonesSubscriber::hub_is_running`] does.
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
 
-    /// As [`ZonesSubscriber::why_silent`].
+    /// Returns why nothing arrives, as [`ZonesSubscriber::why_silent`] does.
     pub fn why_silent(&self) -> Silence {
         self.locked().why_silent()
     }
 
-    /// As [`ZonesSubscriber::silent_for`].
+    /// Returns the duration of the silence, as [`ZonesSubscriber::silent_for`] does.
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }
@@ -184,17 +185,17 @@ impl Pollable<RobotSubscriber> {
     ///
     /// # Errors
     ///
-    /// As [`RobotSubscriber::next`].
+    /// Returns the errors of [`RobotSubscriber::next`].
     pub fn try_next(&self) -> Result<Option<Robot>, Error> {
         Ok(self.locked().try_next()?.cloned())
     }
 
-    /// As [`RobotSubscriber::hub_is_running`].
+    /// Returns whether a hub runs in the domain, as [`RobotSubscriber::hub_is_running`] does.
     pub fn hub_is_running(&self) -> bool {
         self.locked().hub_is_running()
     }
 
-    /// As [`RobotSubscriber::silent_for`].
+    /// Returns the duration of the silence, as [`RobotSubscriber::silent_for`] does.
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }

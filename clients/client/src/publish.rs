@@ -104,8 +104,8 @@ impl PublishSession {
     ///
     /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if another process, or another session of this one, holds the lock.
     /// The message has its process ID. [`ErrorKind::InvalidInput`](crate::ErrorKind) if the limits are invalid;
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind)
-    /// if the directory is another user's.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if the directory is another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Error> {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
@@ -173,9 +173,9 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible; [`ErrorKind::ResourceExhausted`](crate::ErrorKind)
-    /// if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind) if the place is taken by another
-    /// user.
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible;
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Error> {
         check_followed(name)?;
         let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
@@ -220,8 +220,8 @@ impl SensorPublisher {
     ///
     /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if this process publishes it already;
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if only sensors have the topic, and the name has no dot;
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short; [`ErrorKind::Failed`](crate::ErrorKind)
-    /// if the topic exists with another layout.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic exists with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Error> {
         self.topic_for(self.limits())
     }
@@ -358,8 +358,8 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if it is longer than the topic was
-    /// made for.
+    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if it is longer than the
+    /// topic was made for.
     pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_len_with(&header, len, fill)?;
@@ -371,8 +371,8 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than the topic was made for:
-    /// its number is used up.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is no memory for it, or it is longer than the topic
+    /// was made for: its number is used up.
     pub fn send_len_with(
         &mut self,
         header: &Header,

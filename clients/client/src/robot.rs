@@ -159,8 +159,8 @@ impl RobotSubscriber {
         self.session.domain().is_some()
     }
 
-    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which the
-    /// machine was suspended counts (CLOCK_BOOTTIME).
+    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which
+    /// the machine was suspended counts (CLOCK_BOOTTIME).
     pub fn silent_for(&self) -> Duration {
         self.session.silent_for()
     }

@@ -94,8 +94,8 @@ macro_rules! samples {
 scanhub_schema::for_each_topic!(samples);
 
 impl Source {
-    /// As [`new`](Self::new) for the zones of `sensor`, with its early warnings: one makes the verdict worse until the zones of
-    /// its scan are there, or until it is withdrawn.
+    /// As [`new`](Self::new) for the zones of `sensor`, with its early warnings: one makes the verdict worse until the
+    /// zones of its scan are there, or until it is withdrawn.
     pub fn zones_with_early(sensor: &str) -> Source {
         match sensor {
             ROBOT => Source::Robot(RobotSource::new(&[]).with_early()),
@@ -129,8 +129,8 @@ impl Sample {
         self.header().map_or(0, |header| header.period_us)
     }
 
-    /// Returns whether it was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it waited for
-    /// them.
+    /// Returns whether it was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it
+    /// waited for them.
     pub fn is_of_before(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }
@@ -145,8 +145,8 @@ impl Sample {
         self.any().bytes()
     }
 
-    /// Writes the payload as it goes over a network to the beginning of `room`, and returns its length; nothing if there is
-    /// too little room.
+    /// Writes the payload as it goes over a network to the beginning of `room`, and returns its length; nothing if
+    /// there is too little room.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         self.any().pack(room)
     }

@@ -74,8 +74,8 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short. A session that has joined already
-    /// continues without this check.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short. A session that has joined
+    /// already continues without this check.
     pub fn look(&mut self) -> Result<Change, Error> {
         if self.joined.as_mut().is_some_and(|joined| joined.wakeups.take_rang()) {
             self.presence.heard();
@@ -173,8 +173,8 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers are short; [`ErrorKind::Failed`](crate::ErrorKind) if the topic has
-    /// another layout.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers are short;
+    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic has another layout.
     pub fn subscribe<P: Payload + ?Sized>(
         &mut self,
         sensor: &str,
@@ -205,8 +205,8 @@ impl Session {
     }
 
     /// Returns a descriptor that is readable while there may be something to receive or to check. The session waits by
-    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`settle`](Self::settle) makes it
-    /// unreadable. Call this before anything is followed.
+    /// event from now on. The descriptor stays the same when the hub is replaced. Only [`settle`](Self::settle) makes
+    /// it unreadable. Call this before anything is followed.
     ///
     /// # Errors
     ///
@@ -288,7 +288,8 @@ struct Readiness {
 }
 
 impl Readiness {
-    /// Creates a descriptor that is readable at once. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free descriptors.
+    /// Creates a descriptor that is readable at once. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind)
+    /// without free descriptors.
     fn new() -> Result<Readiness, Error> {
         let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
         let clock = timerfd_create(TimerfdClockId::Monotonic, flags).map_err(short)?;
@@ -299,8 +300,8 @@ impl Readiness {
         Ok(readiness)
     }
 
-    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free
-    /// memory.
+    /// Adds `event`, if it is new. The kernel removes it when it is closed. Fails with
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) without free memory.
     fn add(&self, event: BorrowedFd<'_>) -> Result<(), Error> {
         let data = epoll::EventData::new_u64(0);
         match epoll::add(&self.descriptor, event, data, epoll::EventFlags::IN) {

@@ -9,8 +9,8 @@ use crate::error::Error;
 use crate::follower::Follower;
 use crate::session::Session;
 
-/// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user can
-/// do about it.
+/// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user
+/// can do about it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Silence {
@@ -65,7 +65,7 @@ pub enum Silence {
     /// No place, memory or descriptor was left for the subscriber.
     #[non_exhaustive]
     Full {
-        /// What has run out.
+        /// Message that names the exhausted resource.
         message: String,
         /// Ways to get a place.
         remedy: String,

@@ -54,7 +54,8 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         Subscriber { session, follower: Follower::new(sensor), timeout, silence: SilenceCheck::default() }
     }
 
-    /// Waits for the next sample; `None` only after the timeout. Up to four samples may be held while others are received.
+    /// Waits for the next sample; `None` only after the timeout. Up to four samples may be held while others are
+    /// received.
     ///
     /// # Errors
     ///
@@ -77,8 +78,8 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         }
     }
 
-    /// Returns an iterator over the samples, which waits for each of them. It ends after a silence of the timeout; a later
-    /// call continues.
+    /// Returns an iterator over the samples, which waits for each of them. It ends after a silence of the timeout; a
+    /// later call continues.
     ///
     /// # Examples
     ///
@@ -135,8 +136,8 @@ impl<P: Payload + ?Sized> Subscriber<P> {
         self.session.domain().is_some()
     }
 
-    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which the
-    /// machine was suspended counts (CLOCK_BOOTTIME).
+    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which
+    /// the machine was suspended counts (CLOCK_BOOTTIME).
     pub fn silent_for(&self) -> Duration {
         self.session.silent_for()
     }

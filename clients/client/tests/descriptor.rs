@@ -1,5 +1,5 @@
-//! Subscriptions in a poll set: readable when there is something to take, not readable after it was taken, over lives of
-//! the hub.
+//! Subscriptions in a poll set: readable when there is something to take, not readable after it was taken, over lives
+//! of the hub.
 
 mod fake;
 

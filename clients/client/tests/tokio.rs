@@ -1,4 +1,4 @@
-//! Subscribers in tokio: samples as a stream, cancelled waits, and the example.
+//! Subscribers in tokio: samples as a stream, canceled waits, and the example.
 
 #[path = "../../examples/tokio.rs"]
 #[allow(dead_code)] // A test runs its `main` in another process.
@@ -28,7 +28,7 @@ fn scans(place: &Place) -> PollableSubscriber<Scan> {
     Subscriber::<Scan>::builder("front").in_domain(&place.domain).open_pollable().unwrap()
 }
 
-/// Sends scans from another thread while the waits are cancelled: before a scan, while it is sent, and after it.
+/// Sends scans from another thread while the waits are canceled: before a scan, while it is sent, and after it.
 #[test]
 fn a_thousand_cancelled_waits_lose_no_sample() {
     let place = Place::new();

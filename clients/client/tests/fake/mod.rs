@@ -126,14 +126,15 @@ impl FakeSensor {
         self.waker.wake(Wake::Telegram).unwrap();
     }
 
-    /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the sample is
-    /// `seq` ns after that of the hub's first one.
+    /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the
+    /// sample is `seq` ns after that of the hub's first one.
     pub(crate) fn scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
         self.foreground(seq, ranges.len());
         self.scan(ranges);
     }
 
-    /// Publishes the empty foreground of a scan of `beams`, and wakes no subscriber. The next scan is of the same telegram.
+    /// Publishes the empty foreground of a scan of `beams`, and wakes no subscriber. The next scan belongs to the same
+    /// telegram.
     pub(crate) fn foreground(&mut self, seq: u64, beams: usize) {
         self.seq = seq;
         let header = self.header(self.foreground.topic_seq);
