@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use futures_util::StreamExt;
+use futures::StreamExt;
 use scanhub_client::{Error, Scan, Subscriber};
 use tokio::task::JoinSet;
 use tokio::time::timeout;

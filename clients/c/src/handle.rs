@@ -52,10 +52,10 @@ enum Port<T> {
 }
 
 impl<T> Port<T> {
-    fn get_mut(&mut self) -> &mut T {
+    fn subscriber_mut(&mut self) -> &mut T {
         match self {
             Port::Sleeping(subscriber) => subscriber,
-            Port::Pollable(pollable) => pollable.get_mut(),
+            Port::Pollable(pollable) => pollable.subscriber_mut(),
         }
     }
 
@@ -103,15 +103,15 @@ macro_rules! topics {
 
             fn try_next(&mut self) -> Result<Option<Held>, Error> {
                 Ok(match self {
-                    Source::Robot(robot) => robot.get_mut().try_next()?.map(Told::new).map(Held::Robot),
-                    $(Source::$topic(topic) => topic.get_mut().try_next()?.map(Held::$topic),)*
+                    Source::Robot(robot) => robot.subscriber_mut().try_next()?.map(Told::new).map(Held::Robot),
+                    $(Source::$topic(topic) => topic.subscriber_mut().try_next()?.map(Held::$topic),)*
                 })
             }
 
             fn wait(&mut self, longest: Duration) -> Result<(), Error> {
                 match self {
-                    Source::Robot(robot) => robot.get_mut().wait(longest),
-                    $(Source::$topic(topic) => topic.get_mut().wait(longest),)*
+                    Source::Robot(robot) => robot.subscriber_mut().wait(longest),
+                    $(Source::$topic(topic) => topic.subscriber_mut().wait(longest),)*
                 }
             }
 
@@ -124,8 +124,8 @@ macro_rules! topics {
 
             fn hub_lives(&mut self) -> bool {
                 match self {
-                    Source::Robot(robot) => robot.get_mut().hub_is_running(),
-                    $(Source::$topic(topic) => topic.get_mut().hub_is_running(),)*
+                    Source::Robot(robot) => robot.subscriber_mut().hub_is_running(),
+                    $(Source::$topic(topic) => topic.subscriber_mut().hub_is_running(),)*
                 }
             }
         }
@@ -225,7 +225,7 @@ impl Handle {
         let held = match self.found.take() {
             // A verdict has no stamp, and the caller may have waited, so it must be current.
             Some(Held::Robot(found)) => match &mut self.source {
-                Source::Robot(robot) => Held::Robot(Told::new(robot.get_mut().now()?)),
+                Source::Robot(robot) => Held::Robot(Told::new(robot.subscriber_mut().now()?)),
                 _ => Held::Robot(found),
             },
             Some(held) => held,

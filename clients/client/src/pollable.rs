@@ -67,7 +67,7 @@ impl<T> Pollable<T> {
     }
 
     /// Returns the subscriber, for example to wait with its `next`.
-    pub fn get_mut(&mut self) -> &mut T {
+    pub fn subscriber_mut(&mut self) -> &mut T {
         self.subscriber.get_mut().unwrap_or_else(PoisonError::into_inner)
     }
 

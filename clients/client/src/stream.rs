@@ -74,7 +74,7 @@ impl<T> Pollable<T> {
         mut take: impl FnMut(&mut T) -> Result<Option<I>, Error>,
     ) -> Poll<Option<Result<I, Error>>> {
         loop {
-            if let Some(item) = take(self.get_mut()).transpose() {
+            if let Some(item) = take(self.subscriber_mut()).transpose() {
                 return Poll::Ready(Some(item));
             }
             let (registration, descriptor) = self.registration();

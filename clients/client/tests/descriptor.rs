@@ -165,7 +165,7 @@ fn a_pollable_subscriber_can_wait_too() {
     let mut scans = scans(&place);
     assert!(scans.try_next().unwrap().is_none());
     hub.front().scan(&[1000]);
-    assert_eq!(scans.get_mut().next().unwrap().expect("a scan").beams(), 1);
+    assert_eq!(scans.subscriber_mut().next().unwrap().expect("a scan").beams(), 1);
     assert!(is_readable(&scans, LONG), "the event is still to be taken");
 }
 

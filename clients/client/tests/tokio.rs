@@ -13,7 +13,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
-use futures_util::StreamExt;
+use futures::StreamExt;
 use rustix::process::{Pid, Signal, kill_process};
 use scanhub_client::{PollableSubscriber, Scan, Subscriber, ZonesSubscriber};
 use scanhub_schema::Verdict;

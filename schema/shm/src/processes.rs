@@ -35,9 +35,9 @@ pub type Node<S = LocalService> = iceoryx2::node::Node<S>;
 /// Role of a process in a domain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// It holds a [`HubLock`], [`ListenLock`] or [`NameLock`].
+    /// A process that holds a [`HubLock`], [`ListenLock`] or [`NameLock`].
     Publisher,
-    /// It only follows topics.
+    /// A process that only follows topics.
     Subscriber,
 }
 
