@@ -9,7 +9,7 @@
 use scanhub_config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
 use scanhub_schema::{
-    Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Scan, Verb, Wake, Zones,
+    Background, Contents, Failure, Flags, Foreground, Header, Nanos, Pose, Ring, Scan, Verb, Wake, Zones,
 };
 
 use crate::early::{EarlyMessage, EarlyWarner};
@@ -173,6 +173,8 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         pipeline.check_zones(scan, zones.payload_mut());
         topics.publishers.zones.send(zones, &header, &mut topics.due);
         topics.end_stage(Stage::Zones);
+        // A subscriber that attached during this scan may have received the zones.
+        topics.ring(Ring::First);
 
         // Marks, lines and motion.
         let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
@@ -188,7 +190,7 @@ impl<'a, S: Platform> LinkOutput<'a, S> {
         // Foreground and background.
         self.update_background(&header);
         self.topics.end_stage(Stage::Background);
-        // A subscriber that attached during this scan may have received zones or a background, which have a history.
+        // A subscriber that attached during this scan may have received a background, which has a history.
         if self.topics.is_ring_due() {
             self.topics.wake(Wake::Telegram);
         }

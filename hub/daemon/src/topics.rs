@@ -364,7 +364,7 @@ impl<'a, S: Platform> Topics<'a, S> {
     }
 
     /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
-    fn ring(&mut self, ring: Ring) {
+    pub(crate) fn ring(&mut self, ring: Ring) {
         if self.due.take(ring) {
             self.platform.ring(ring);
         }

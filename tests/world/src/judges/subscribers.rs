@@ -10,7 +10,7 @@ use crate::event::Event;
 use crate::topics::Sample;
 
 /// Judge: a subscriber gets the samples of every scan that begins after it has attached (`docs/topics.md`). The doorbell rings
-/// once all samples of a ring are sent, before the next telegram, and only if a sample of that ring has a subscriber. The event
+/// once all samples of a ring are sent, before those of the next ring and the next telegram, and only if a sample of that ring has a subscriber. The event
 /// follows if one of its listeners has a sample.
 pub(crate) struct Subscribers {
     sensors: Vec<OfSensor>,
@@ -109,6 +109,9 @@ impl OfSensor {
                 self.due[ring as usize] = None;
                 broken.push(format!("{ring:?} was not rung after {due}, before {topic:?} of {seq}"));
             }
+        }
+        if AFTER_ZONES.contains(&topic) && self.due[Ring::First as usize] == Some(seq) {
+            broken.push(format!("First was not rung before {topic:?} of {seq}"));
         }
         if let Some(unheard) = self.unheard.filter(|&unheard| is_next && unheard < seq) {
             self.unheard = None;
