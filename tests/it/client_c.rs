@@ -181,6 +181,53 @@ fn a_program_in_c_outlives_its_hub() {
     drop(simulator);
 }
 
+#[test]
+fn a_program_in_c_learns_why_no_sample_arrives() {
+    // SCANHUB_SILENCE_.. of the header.
+    let [waiting, no_hub, unknown_sensor, paused] = [0, 1, 3, 6];
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let silence = installed.compile(&env, &source("silence.c"), &[]);
+    let start = |sensor, way| program(&env, &silence, &[sensor, way]);
+    let mut scans = start("front", "doorbell");
+    let mut mistyped = ["doorbell", "event"].map(|way| start("frnot", way));
+    let has = |reason: u64, text: &'static str| {
+        move |line: &Value| {
+            line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
+        }
+    };
+    for follower in mistyped.iter_mut().chain([&mut scans]) {
+        let line = follower.await_line("there is no hub", has(no_hub, "scanhub run"));
+        assert_eq!((&line["sensors"], &line["topics"]), (&"".into(), &"".into()), "{line}");
+        let earlier = number(&line, "silent_ns");
+        let later = follower.await_line("time passes", is_class("silence"));
+        assert!(number(&later, "silent_ns") > earlier, "{line}, {later}");
+    }
+    // Without a hub, a poll of half a second times out, so the program prints its lines.
+    let polled = mistyped[1].await_lines(6, "timeouts", is_class("silence"));
+    let wakeups: u64 = polled.iter().map(|line| number(line, "wakeups")).sum();
+    assert!(wakeups <= 5, "{polled:?}");
+
+    let _simulators = ["front", "rear"].map(|name| env.simulator(&[name], &["--baud=500000"]));
+    let _hub = env.hub(&[env.link("front"), env.link("rear")]);
+    for follower in &mut mistyped {
+        let is_it = has(unknown_sensor, "no sensor frnot\n  the sensors are front, rear");
+        let line = follower.await_line("the names that exist", is_it);
+        assert_eq!(line["sensors"], "front rear", "{line}");
+        let topics: Vec<&str> = line["topics"].as_str().expect("a text").split(' ').collect();
+        assert!(topics.contains(&"front/scan") && topics.contains(&"rear/status"), "{line}");
+        // Sensor by sensor.
+        assert!(topics.is_sorted_by_key(|topic| topic.split('/').next()), "{line}");
+    }
+    let is_streaming = |line: &Value| has(waiting, "")(line) && number(line, "silent_ns") < 100_000_000;
+    scans.await_line("scans", is_streaming);
+    assert_eq!(env.run(&["control", "front", "pause"]).code, Some(0));
+    let line = scans.await_line("the pause", has(paused, "front is paused\n  scanhub resume front"));
+    assert!(number(&line, "silent_ns") > 0, "{line}");
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    scans.await_line("scans again", is_streaming);
+}
+
 /// Nobody who acts on zones needs a clock.
 #[test]
 fn zones_get_unknown_when_the_hub_is_killed() {

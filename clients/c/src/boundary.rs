@@ -77,6 +77,29 @@ pub(crate) fn sample<'a>(address: *mut Lent) -> Result<&'a mut Lent, CallError> 
     unsafe { address.as_mut() }.ok_or(NULL)
 }
 
+/// Returns the memory for an optional output argument. `None` for NULL.
+pub(crate) fn optional_place<'a, T>(address: *mut T) -> Result<Option<&'a mut MaybeUninit<T>>, CallError> {
+    if address.is_null() { Ok(None) } else { place(address).map(Some) }
+}
+
+/// Writes `names` to the `size` bytes at `address`, separated by blanks and followed by a 0. If not all of them fit, it
+/// writes the first ones. Returns the length of the complete text without its 0.
+pub(crate) fn write_names(names: &[String], address: *mut c_char, size: usize) -> Result<c_int, CallError> {
+    let text = names.join(" ");
+    if size > 0 {
+        check(address)?;
+        let is_end = |end: &usize| *end < size && (*end == text.len() || text.as_bytes()[*end] == b' ');
+        let end = (1..=text.len()).rev().find(is_end).unwrap_or(0);
+        // SAFETY: the address is not NULL, and the header requires room for `size` bytes that only the library uses
+        // during the call. It writes `end` + 1 bytes, and `end` is less than `size`.
+        unsafe {
+            ptr::copy_nonoverlapping(text.as_ptr(), address.cast(), end);
+            address.add(end).write(0);
+        }
+    }
+    Ok(c_int::try_from(text.len()).unwrap_or(c_int::MAX))
+}
+
 fn check<T>(address: *mut T) -> Result<(), CallError> {
     if address.is_null() {
         return Err(NULL);

@@ -9,8 +9,9 @@ use std::time::Duration;
 use scanhub_client::Wait;
 use scanhub_schema::{Tilt, Topic};
 
-use crate::boundary::{CallError, Lent, last_message, place, sample, text};
+use crate::boundary::{CallError, Lent, last_message, optional_place, place, sample, text, write_names};
 use crate::handle::{Handle, Mount, Opaque, insert, remove, with};
+use crate::silence::{sensors, topics};
 
 /// Subscribes to a topic. Returns 0.
 #[unsafe(no_mangle)]
@@ -160,6 +161,48 @@ pub extern "C" fn scanhub_unpublish(publication: *mut Opaque) -> c_int {
 #[unsafe(no_mangle)]
 pub extern "C" fn scanhub_hub_lives(handle: *mut Opaque) -> c_int {
     answer(|| with(handle, |handle: &mut Handle| Ok(handle.hub_lives().into())))
+}
+
+/// Sets the time since the last sample, in ns. Returns 0.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_silent_for(handle: *mut Opaque, silent_ns: *mut u64) -> c_int {
+    answer(|| {
+        let silent_ns = place(silent_ns)?;
+        silent_ns.write(0);
+        let silent_for = with(handle, |handle: &mut Handle| Ok(handle.silent_for()))?;
+        silent_ns.write(u64::try_from(silent_for.as_nanos()).unwrap_or(u64::MAX));
+        Ok(0)
+    })
+}
+
+/// Returns the reason why no sample arrives, and sets its text.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_why_silent(handle: *mut Opaque, text: *mut *const c_char) -> c_int {
+    answer(|| {
+        let mut text = optional_place(text)?;
+        if let Some(text) = &mut text {
+            text.write(c"".as_ptr());
+        }
+        with(handle, |handle: &mut Handle| {
+            let (reason, message) = handle.why_silent()?;
+            if let Some(text) = text {
+                text.write(message.as_ptr());
+            }
+            Ok(reason)
+        })
+    })
+}
+
+/// Writes the names of the sensors in a domain. Returns the length of the complete text.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_sensors(domain: *const c_char, names: *mut c_char, size: usize) -> c_int {
+    answer(|| write_names(&sensors(text(domain)?)?, names, size))
+}
+
+/// Writes the topics of all sensors in a domain. Returns the length of the complete text.
+#[unsafe(no_mangle)]
+pub extern "C" fn scanhub_topics(domain: *const c_char, names: *mut c_char, size: usize) -> c_int {
+    answer(|| write_names(&topics(text(domain)?)?, names, size))
 }
 
 /// Returns the message of the last error of this thread.

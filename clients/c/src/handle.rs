@@ -7,7 +7,7 @@
 
 use std::any::Any;
 use std::cell::RefCell;
-use std::ffi::{CString, c_char, c_int};
+use std::ffi::{CStr, CString, c_char, c_int};
 use std::os::fd::AsRawFd;
 use std::process;
 use std::ptr;
@@ -16,12 +16,13 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Error, Heard, Payload, Pollable, Publication, Received, Robot, RobotSubscriber, Subscriber,
+    Error, Heard, Payload, Pollable, Publication, Received, Robot, RobotSubscriber, Silence, Subscriber,
     SubscriberBuilder, Wait, ZonesSubscriber, publish_domain,
 };
 use scanhub_schema::{Failure, Header, Kind, Tilt, Topic, limits};
 
 use crate::boundary::{CallError, Lent};
+use crate::silence::{silence_number, silence_text};
 
 /// An open subscription.
 pub(crate) struct Handle {
@@ -30,6 +31,8 @@ pub(crate) struct Handle {
     found: Option<Held>,
     next: u64,
     source: Source,
+    /// Text of the last reason for a silence, which the program may still read.
+    silence: CString,
 }
 
 /// Maximum number of samples that are lent at a time: as many as a subscriber can borrow from the hub.
@@ -128,6 +131,21 @@ macro_rules! topics {
                     $(Source::$topic(topic) => topic.subscriber_mut().hub_is_running(),)*
                 }
             }
+
+            fn silent_for(&mut self) -> Duration {
+                match self {
+                    Source::Robot(robot) => robot.subscriber_mut().silent_for(),
+                    $(Source::$topic(topic) => topic.subscriber_mut().silent_for(),)*
+                }
+            }
+
+            /// Returns `None` for a robot: each of its sensors has its own reason.
+            fn why_silent(&mut self) -> Option<Silence> {
+                match self {
+                    Source::Robot(_) => None,
+                    $(Source::$topic(topic) => Some(topic.subscriber_mut().why_silent()),)*
+                }
+            }
         }
 
         impl Held {
@@ -195,7 +213,7 @@ impl Handle {
     }
 
     fn of(source: Source) -> Handle {
-        Handle { lent: Default::default(), found: None, next: 1, source }
+        Handle { lent: Default::default(), found: None, next: 1, source, silence: CString::default() }
     }
 
     /// Waits until there is a sample to take, but not longer than `timeout`. Returns whether there is a sample.
@@ -257,6 +275,23 @@ impl Handle {
     /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`] does.
     pub(crate) fn hub_lives(&mut self) -> bool {
         self.source.hub_lives()
+    }
+
+    /// Returns the time since the last sample, as [`Subscriber::silent_for`] does.
+    pub(crate) fn silent_for(&mut self) -> Duration {
+        self.source.silent_for()
+    }
+
+    /// Returns why no sample arrives, as [`Subscriber::why_silent`] does: SCANHUB_SILENCE_.. of the header, and the text,
+    /// which lives until the next call. Fails for a robot.
+    pub(crate) fn why_silent(&mut self) -> Result<(c_int, &CStr), CallError> {
+        let silence = self.source.why_silent().ok_or_else(|| {
+            let hint = "scanhub_open each of its sensors, and use those handles";
+            Error::from(Failure::new(Kind::Configuration, "a robot has no single reason for a silence", hint))
+        })?;
+        // Messages are printable, so they contain no 0.
+        self.silence = CString::new(silence_text(&silence)).unwrap_or_default();
+        Ok((silence_number(&silence), &self.silence))
     }
 }
 

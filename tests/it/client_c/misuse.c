@@ -66,6 +66,11 @@ static void refused_as_a_handle(struct scanhub_attachment *handle)
     MUST(scanhub_take(handle, &sample) == SCANHUB_REFUSED_ARGUMENT);
     MUST(sample.header == NULL && sample.payload == NULL && scanhub_release(&sample) == 0);
     MUST(scanhub_hub_lives(handle) == SCANHUB_REFUSED_ARGUMENT);
+    uint64_t silent_ns = 1;
+    MUST(scanhub_silent_for(handle, &silent_ns) == SCANHUB_REFUSED_ARGUMENT && silent_ns == 0);
+    const char *text = NULL;
+    MUST(scanhub_why_silent(handle, NULL) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_why_silent(handle, &text) == SCANHUB_REFUSED_ARGUMENT && text[0] == '\0');
 }
 
 static void handles(const char *sensor)
@@ -81,9 +86,33 @@ static void handles(const char *sensor)
     MUST(scanhub_take(handle, NULL) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_take(handle, (struct scanhub_sample *)((char *)&handle + 1)) == SCANHUB_REFUSED_ARGUMENT);
     SAYS("aligned");
+    MUST(scanhub_silent_for(handle, NULL) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_why_silent(handle, NULL) >= 0);
     MUST(scanhub_close(handle) == 0);
     refused_as_a_handle(handle);
     MUST(scanhub_close(handle) == SCANHUB_REFUSED_ARGUMENT);
+}
+
+static void names_that_exist(void)
+{
+    char buffer[64], guarded[8];
+    const char *text;
+    struct scanhub_attachment *robot;
+    MUST(scanhub_sensors(NULL, NULL, 0) == 5 && scanhub_sensors(NULL, buffer, sizeof buffer) == 5);
+    MUST(strcmp(buffer, "front") == 0);
+    MUST(scanhub_sensors(NULL, buffer, 6) == 5 && strcmp(buffer, "front") == 0);
+    MUST(scanhub_sensors(NULL, buffer, 5) == 5 && buffer[0] == '\0');
+    memset(guarded, 'x', sizeof guarded);
+    MUST(scanhub_topics(NULL, guarded, 1) > 20 && guarded[0] == '\0' && guarded[1] == 'x');
+    MUST(scanhub_topics(NULL, buffer, sizeof buffer) >= (int)sizeof buffer);
+    MUST(strncmp(buffer, "front/", 6) == 0 && strlen(buffer) < sizeof buffer && strrchr(buffer, '/')[1] != '\0');
+    MUST(scanhub_sensors("no-hub-is-here", buffer, sizeof buffer) == 0 && buffer[0] == '\0');
+    MUST(scanhub_sensors(NULL, NULL, 1) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_topics("no/domain", buffer, sizeof buffer) == SCANHUB_REFUSED_CONFIGURATION);
+    MUST(scanhub_open_robot(&robot, NULL, NULL, 0) == 0);
+    MUST(scanhub_why_silent(robot, &text) == SCANHUB_REFUSED_CONFIGURATION && text[0] == '\0');
+    SAYS("each of its sensors");
+    MUST(scanhub_close(robot) == 0);
 }
 
 static void refused_as_a_publication(struct scanhub_publication *publication)
@@ -310,6 +339,7 @@ int main(int argc, char **argv)
 {
     const char *sensor = argc > 1 ? argv[1] : "front";
     names(sensor);
+    names_that_exist();
     handles(sensor);
     threads(sensor);
     children(sensor);

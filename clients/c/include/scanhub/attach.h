@@ -50,6 +50,17 @@ extern "C" {
 #define SCANHUB_WAIT_EVENT 1    /* at a descriptor, which poll and epoll can wait at too: scanhub_fd */
 #define SCANHUB_WAIT_SPIN 2     /* not asleep: takes a whole processor for the shortest latency there is */
 
+/* Reasons why no sample arrives, from scanhub_why_silent. Later versions may have more. */
+#define SCANHUB_SILENCE_WAITING 0        /* nothing is wrong as far as the library knows, or the hub is starting */
+#define SCANHUB_SILENCE_NO_HUB 1         /* no hub runs in the domain */
+#define SCANHUB_SILENCE_OTHER_USER 2     /* only another user runs a hub in the domain */
+#define SCANHUB_SILENCE_UNKNOWN_SENSOR 3 /* the hub has no such sensor; the text has the names that exist */
+#define SCANHUB_SILENCE_UNKNOWN_TOPIC 4  /* the hub does not publish this topic of the sensor */
+#define SCANHUB_SILENCE_ABSENT 5         /* the scanner sends no data */
+#define SCANHUB_SILENCE_PAUSED 6         /* the link is paused on request */
+#define SCANHUB_SILENCE_FULL 7           /* no place, memory or descriptor is left for this subscriber */
+#define SCANHUB_SILENCE_OTHER 8          /* another reason: see the text */
+
 /* A topic that is followed. */
 struct scanhub_attachment;
 
@@ -611,10 +622,11 @@ int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, c
 int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
- * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed. It
- * stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has returned 0: take
- * all, then poll. A readable descriptor does not promise a sample: it also becomes readable once a second, ten times a second
- * while there is no hub, and when other topics of the sensor have a sample. Only with SCANHUB_WAIT_EVENT.
+ * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed.
+ * It stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has returned
+ * 0: take all, then poll. A readable descriptor does not promise a sample. It also becomes readable when a hub starts
+ * or ends, and when other topics of the sensor have a sample. While a hub runs, it becomes readable once a second, and
+ * ten times a second just after the start of the hub. Only with SCANHUB_WAIT_EVENT.
  */
 int scanhub_fd(struct scanhub_attachment *handle);
 
@@ -641,6 +653,32 @@ int scanhub_close(struct scanhub_attachment *handle);
 
 /* 1 if a hub lives in the domain, 0 if not, as of the last call that found no sample. */
 int scanhub_hub_lives(struct scanhub_attachment *handle);
+
+/*
+ * Sets *silent_ns to the nanoseconds since the last sample; if there was none, since scanhub_open: 0. Time during which
+ * the machine was suspended counts (CLOCK_BOOTTIME).
+ */
+int scanhub_silent_for(struct scanhub_attachment *handle, uint64_t *silent_ns);
+
+/*
+ * Returns the reason why no sample arrives, one of SCANHUB_SILENCE_.. . Never waits, and is cheap enough for once a
+ * second. Sets *text, unless `text` is NULL, to a line with the reason, followed by a line with the remedy, except for
+ * SCANHUB_SILENCE_WAITING. The text is valid until the next call of this function with this handle, or until
+ * scanhub_close. A handle of scanhub_open_robot is refused with SCANHUB_REFUSED_CONFIGURATION, because each of its
+ * sensors has its own reason.
+ */
+int scanhub_why_silent(struct scanhub_attachment *handle, const char **text);
+
+/*
+ * Writes the names of the sensors in `domain` (NULL: the one that SCANHUB_DOMAIN names) to `names`, sorted, with blanks
+ * between them and a 0 at the end: "front rear". There are none if no hub runs, or only another user's. Returns the
+ * bytes of the complete text without its 0. If this is `size` or more, only the names that fit were written: give a
+ * larger buffer. `names` may be NULL if `size` is 0. Never waits.
+ */
+int scanhub_sensors(const char *domain, char *names, size_t size);
+
+/* Writes the topics of all sensors, sensor by sensor, as scanhub_sensors writes names: "front/scan rear/scan". */
+int scanhub_topics(const char *domain, char *names, size_t size);
 
 /*
  * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN names),

@@ -14,10 +14,12 @@
 
 #include <scanhub/attach.h>
 
-#include <stdexcept>
-#include <utility>
-#if __cplusplus >= 201703L
 #include <chrono>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+#if __cplusplus >= 201703L
 #include <optional>
 #endif
 #if __cplusplus >= 202002L
@@ -97,6 +99,14 @@ private:
     int topic_;
 };
 
+/* Why no sample arrives. */
+struct Silence {
+    /* One of SCANHUB_SILENCE_... . */
+    int reason;
+    /* A line with the reason, and a line with the remedy, except for SCANHUB_SILENCE_WAITING. */
+    std::string text;
+};
+
 /* A topic that is followed, in the thread that made it. */
 class Attachment {
 public:
@@ -161,6 +171,20 @@ public:
     int fd() { return check(scanhub_fd(handle_)); }
     /* As scanhub_hub_lives. */
     bool hub_lives() { return check(scanhub_hub_lives(handle_)) == 1; }
+    /* The time since the last sample, as scanhub_silent_for. */
+    std::chrono::nanoseconds silent_for()
+    {
+        uint64_t silent_ns = 0;
+        check(scanhub_silent_for(handle_, &silent_ns));
+        return std::chrono::nanoseconds(static_cast<std::chrono::nanoseconds::rep>(silent_ns));
+    }
+    /* Why no sample arrives, as scanhub_why_silent. Never waits. */
+    Silence why_silent()
+    {
+        const char *text = "";
+        const int reason = check(scanhub_why_silent(handle_, &text));
+        return Silence{reason, text};
+    }
 
 private:
     Attachment() : handle_(nullptr), topic_(0) {}
@@ -219,6 +243,29 @@ inline std::span<const scanhub_cloud_point_v2> cloud_points(const Sample &cloud)
     return {first, first == nullptr ? 0u : head.count};
 }
 #endif
+
+/* The names that `list` writes: scanhub_sensors or scanhub_topics. */
+inline std::vector<std::string> names_of(int (*list)(const char *, char *, size_t), const char *domain)
+{
+    std::vector<char> text(1);
+    // The names may change between two calls.
+    for (size_t length; (length = static_cast<size_t>(check(list(domain, text.data(), text.size())))) >= text.size();)
+        text.resize(length + 1);
+    std::vector<std::string> names;
+    for (const char *at = text.data(); *at != '\0'; at += *at == ' ') {
+        const char *const first = at;
+        while (*at != '\0' && *at != ' ')
+            at++;
+        names.emplace_back(first, at);
+    }
+    return names;
+}
+
+/* The names of the sensors in a domain, as scanhub_sensors. */
+inline std::vector<std::string> sensors(const char *domain = nullptr) { return names_of(scanhub_sensors, domain); }
+
+/* The topics of all sensors in a domain, as "front/scan", as scanhub_topics. */
+inline std::vector<std::string> topics(const char *domain = nullptr) { return names_of(scanhub_topics, domain); }
 
 /* The angles of a mount that this thread publishes, as scanhub_publish_tilt. */
 class TiltPublication {
