@@ -181,9 +181,33 @@ fn a_program_in_c_outlives_its_hub() {
     drop(simulator);
 }
 
+/// Returns whether a line has this reason, SCANHUB_SILENCE_.. of the header, and `text` is a part of its text.
+fn has(reason: u64, text: &str) -> impl Fn(&Value) -> bool {
+    move |line| line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
+}
+
+#[test]
+fn a_program_in_c_names_the_user_of_a_domain() {
+    if !rustix::process::getuid().is_root() {
+        eprintln!("skipped: only root can create a directory of another user");
+        return;
+    }
+    let Some(installed) = Installed::once() else { return };
+    let env = TestEnv::new();
+    let silence = installed.compile(&env, &source("silence.c"), &[]);
+    let place = env.place();
+    std::fs::create_dir_all(place.root()).expect("a directory");
+    std::os::unix::fs::chown(place.root(), Some(65_534), Some(65_534)).expect("root may");
+    let other_user = 2;
+    for way in ["doorbell", "event"] {
+        let mut follower = program(&env, &silence, &["front", way]);
+        let line = follower.await_line("the other user", has(other_user, "belongs to user"));
+        assert!(has(other_user, "\n  ")(&line), "no remedy: {line}");
+    }
+}
+
 #[test]
 fn a_program_in_c_learns_why_no_sample_arrives() {
-    // SCANHUB_SILENCE_.. of the header.
     let [waiting, no_hub, unknown_sensor, paused] = [0, 1, 3, 6];
     let Some(installed) = Installed::once() else { return };
     let env = TestEnv::new();
@@ -191,11 +215,6 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
     let start = |sensor, way| program(&env, &silence, &[sensor, way]);
     let mut scans = start("front", "doorbell");
     let mut mistyped = ["doorbell", "event"].map(|way| start("frnot", way));
-    let has = |reason: u64, text: &'static str| {
-        move |line: &Value| {
-            line["reason"] == reason && line["text"].as_str().is_some_and(|it| it.contains(text))
-        }
-    };
     for follower in mistyped.iter_mut().chain([&mut scans]) {
         let line = follower.await_line("there is no hub", has(no_hub, "scanhub run"));
         assert_eq!((&line["sensors"], &line["topics"]), (&"".into(), &"".into()), "{line}");
