@@ -85,6 +85,11 @@ pub fn json_line(line: String) -> String {
 pub enum Kind {
     /// Something failed that has no kind of its own: exit 1.
     Failed,
+    /// Another user owns the domain or a file in it: exit 1. Its name is that of [`Kind::Failed`].
+    OtherUser,
+    /// The hub has another layout, or another version of the shared memory: exit 1. Its name is that of
+    /// [`Kind::Failed`].
+    Incompatible,
     /// Another hub holds the domain: exit 1.
     DomainHeld,
     /// Another process publishes under the name: exit 75.
@@ -125,7 +130,7 @@ impl Kind {
     /// Returns the value of key `kind` in an `error` line.
     pub fn name(self) -> &'static str {
         match self {
-            Kind::Failed => "failed",
+            Kind::Failed | Kind::OtherUser | Kind::Incompatible => "failed",
             Kind::DomainHeld => "domain_held",
             Kind::NameHeld => "name_held",
             Kind::Usage => "usage",
@@ -149,7 +154,7 @@ impl Kind {
     /// Returns the process's exit code.
     pub fn exit_code(self) -> u8 {
         match self {
-            Kind::Failed | Kind::DomainHeld => 1,
+            Kind::Failed | Kind::OtherUser | Kind::Incompatible | Kind::DomainHeld => 1,
             Kind::Usage => 2,
             Kind::NoHub | Kind::NoTopic | Kind::Timeout => 3,
             Kind::PortMissing | Kind::PortPermission | Kind::PortBusy | Kind::PortNotTty | Kind::PortRate => {

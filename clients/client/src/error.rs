@@ -53,7 +53,11 @@ pub enum ErrorKind {
     ResourceExhausted,
     /// The program holds four samples of one subscriber.
     TooManyHeld,
-    /// The domain belongs to another user, the hub has another version, or the link cannot do what was requested.
+    /// The domain, or a file in it, belongs to another user.
+    OtherUser,
+    /// The hub has another layout, or another version of the shared memory.
+    Incompatible,
+    /// Any other failure, for example of a request that the link cannot execute.
     Failed,
 }
 
@@ -61,6 +65,7 @@ pub enum ErrorKind {
 #[derive(Clone, Debug)]
 pub struct Cause {
     failure: Failure,
+    kind: ErrorKind,
     source: Option<Arc<dyn error::Error + Send + Sync>>,
 }
 
@@ -77,19 +82,19 @@ impl Error {
         self
     }
 
+    /// Returns this error with another class. The exit code of a program that ends with it stays the same.
+    pub(crate) fn with_kind(mut self, kind: ErrorKind) -> Error {
+        if let Error::Failed(cause) = &mut self {
+            cause.kind = kind;
+        }
+        self
+    }
+
     /// Returns the class of the error.
     pub fn kind(&self) -> ErrorKind {
-        let Error::Failed(cause) = self else { return ErrorKind::TooManyHeld };
-        match cause.failure.kind {
-            Kind::Usage | Kind::Configuration => ErrorKind::InvalidInput,
-            Kind::NoHub => ErrorKind::NoHub,
-            Kind::NoTopic => ErrorKind::NoTopic,
-            Kind::Timeout => ErrorKind::Timeout,
-            Kind::Interrupted => ErrorKind::Interrupted,
-            Kind::DomainHeld => ErrorKind::DomainHeld,
-            Kind::NameHeld => ErrorKind::NameHeld,
-            Kind::Short => ErrorKind::ResourceExhausted,
-            _ => ErrorKind::Failed,
+        match self {
+            Error::TooManyHeld => ErrorKind::TooManyHeld,
+            Error::Failed(cause) => cause.kind,
         }
     }
 
@@ -130,7 +135,20 @@ impl error::Error for Error {
 
 impl From<Failure> for Error {
     fn from(failure: Failure) -> Error {
-        Error::Failed(Box::new(Cause { failure, source: None }))
+        let kind = match failure.kind {
+            Kind::Usage | Kind::Configuration => ErrorKind::InvalidInput,
+            Kind::NoHub => ErrorKind::NoHub,
+            Kind::NoTopic => ErrorKind::NoTopic,
+            Kind::Timeout => ErrorKind::Timeout,
+            Kind::Interrupted => ErrorKind::Interrupted,
+            Kind::DomainHeld => ErrorKind::DomainHeld,
+            Kind::NameHeld => ErrorKind::NameHeld,
+            Kind::Short => ErrorKind::ResourceExhausted,
+            Kind::OtherUser => ErrorKind::OtherUser,
+            Kind::Incompatible => ErrorKind::Incompatible,
+            _ => ErrorKind::Failed,
+        };
+        Error::Failed(Box::new(Cause { failure, kind, source: None }))
     }
 }
 
@@ -173,6 +191,10 @@ mod tests {
         assert_eq!(kind(Kind::Usage), ErrorKind::InvalidInput);
         assert_eq!(kind(Kind::Short), ErrorKind::ResourceExhausted);
         assert_eq!(kind(Kind::PortBusy), ErrorKind::Failed);
+        assert_eq!(kind(Kind::Incompatible), ErrorKind::Incompatible);
+        assert_eq!(kind(Kind::OtherUser), ErrorKind::OtherUser);
+        let no_hub = Error::new(Kind::NoHub, "", "").with_kind(ErrorKind::OtherUser);
+        assert_eq!((no_hub.kind(), Failure::from(no_hub).kind), (ErrorKind::OtherUser, Kind::NoHub));
         assert_eq!(Error::TooManyHeld.kind(), ErrorKind::TooManyHeld);
         assert!(!Error::TooManyHeld.remedy().is_empty());
     }

@@ -9,6 +9,7 @@ use scanhub_shm::{Payload, ReceiveError, Sample, Subscriber, ThreadSafeService};
 
 use crate::error::{Error, ErrorKind};
 use crate::session::Session;
+use crate::silence::{Silence, SilenceCheck};
 
 /// A sample in shared memory: `*` gives the payload, read-only, without a copy. Hold at most four samples of a
 /// subscriber at a time. They stay valid while it waits, and after the hub has ended.
@@ -82,6 +83,11 @@ impl<P: Payload + ?Sized> Follower<P> {
         self.port.is_some()
     }
 
+    /// Returns why nothing is received. Never waits.
+    pub(crate) fn why_silent(&self, session: &mut Session, check: &mut SilenceCheck) -> Silence {
+        check.reason(session, self)
+    }
+
     pub(crate) fn sensor(&self) -> &str {
         &self.sensor
     }
@@ -102,7 +108,7 @@ impl<P: Payload + ?Sized> Follower<P> {
     ///
     /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived,
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if descriptors or memory are short,
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic has another layout.
+    /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
         let received = self.receive_quietly(session)?;
         if received.is_some() {

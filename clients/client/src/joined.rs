@@ -165,8 +165,8 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
     /// Returns why no sample of one of the topics arrives, as
     /// [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
     pub fn why_silent(&mut self) -> Silence {
-        match self.silence.reason(&mut self.session, &self.first.follower) {
-            Silence::Waiting => self.silence.reason(&mut self.session, &self.second.follower),
+        match self.first.follower.why_silent(&mut self.session, &mut self.silence) {
+            Silence::Waiting => self.second.follower.why_silent(&mut self.session, &mut self.silence),
             reason => reason,
         }
     }

@@ -129,6 +129,7 @@ pub mod streams {
     pub use crate::robot::{RobotHeard, RobotSource};
     pub use crate::sample::{Sample, Source};
     pub use crate::session::Session;
+    pub use crate::silence::SilenceCheck;
     pub use crate::zones::{Freshness, ZonesSource, ZonesState};
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use scanhub_schema::{Failure, Kind};
 use scanhub_shm::{Domain, Environment, RunningHub, holder, publisher};
 
-use crate::error::Error;
+use crate::error::{Error, ErrorKind};
 use crate::silence::Silence;
 
 /// Interval of the queries of the locks.
@@ -140,14 +140,21 @@ impl Presence {
     }
 
     /// Returns the failure for callers that cannot wait for a hub.
-    pub(crate) fn no_hub(&self) -> Failure {
-        self.no_hub_beside(|| RunningHub::all(Path::new("/")))
+    pub(crate) fn no_hub(&self) -> Error {
+        self.of_denied(self.no_hub_beside(|| RunningHub::all(Path::new("/"))))
     }
 
     /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. A
     /// directory that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
-    pub(crate) fn no_hub_here(&self) -> Failure {
-        self.no_hub_beside(Vec::new)
+    pub(crate) fn no_hub_here(&self) -> Error {
+        self.of_denied(self.no_hub_beside(Vec::new))
+    }
+
+    /// Returns the error for `failure`. Its class is that of another user's directory, if one was found.
+    fn of_denied(&self, failure: Failure) -> Error {
+        let is_of_other = self.denied.as_ref().is_some_and(|denied| denied.kind == Kind::OtherUser);
+        let error = Error::from(failure);
+        if is_of_other { error.with_kind(ErrorKind::OtherUser) } else { error }
     }
 
     /// Returns why there is no hub, for a subscriber that waits for one. It reads /proc: a few milliseconds.
@@ -231,7 +238,8 @@ fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], call
 ///
 /// # Errors
 ///
-/// [`ErrorKind::NoHub`](crate::ErrorKind) after half a second.
+/// [`ErrorKind::NoHub`](crate::ErrorKind) after half a second; [`ErrorKind::OtherUser`](crate::ErrorKind) if the domain
+/// belongs to another user.
 pub fn find(places: &[Domain]) -> Result<Domain, Error> {
     let give_up_at = Instant::now() + GRACE;
     let mut presence = Presence::new(places.to_vec());
@@ -241,7 +249,7 @@ pub fn find(places: &[Domain]) -> Result<Domain, Error> {
             return Ok(domain.clone());
         }
         if Instant::now() >= give_up_at {
-            return Err(presence.no_hub().into());
+            return Err(presence.no_hub());
         }
         std::thread::sleep(LOOK_EVERY);
     }

@@ -105,7 +105,7 @@ impl PublishSession {
     /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if another process, or another session of this one, holds the lock.
     /// The message has its process ID. [`ErrorKind::InvalidInput`](crate::ErrorKind) if the limits are invalid;
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if the directory is another user's.
+    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the directory is another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Error> {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
@@ -175,7 +175,7 @@ impl PublishSession {
     ///
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is not possible;
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if the place is taken by another user.
+    /// [`ErrorKind::OtherUser`](crate::ErrorKind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Error> {
         check_followed(name)?;
         let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
@@ -221,7 +221,7 @@ impl SensorPublisher {
     /// [`ErrorKind::DomainHeld`](crate::ErrorKind) if this process publishes it already;
     /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if only sensors have the topic, and the name has no dot;
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory or descriptors are short;
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic exists with another layout.
+    /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic exists with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Error> {
         self.topic_for(self.limits())
     }

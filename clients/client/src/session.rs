@@ -150,12 +150,12 @@ impl Session {
 
     /// Returns the failure for callers that cannot wait for a hub.
     pub fn no_hub(&self) -> Error {
-        self.presence.no_hub().into()
+        self.presence.no_hub()
     }
 
     /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
     pub fn no_hub_here(&self) -> Error {
-        self.presence.no_hub_here().into()
+        self.presence.no_hub_here()
     }
 
     /// Returns why no hub runs, as of the last look.
@@ -174,7 +174,7 @@ impl Session {
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers are short;
-    /// [`ErrorKind::Failed`](crate::ErrorKind) if the topic has another layout.
+    /// [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
     pub fn subscribe<P: Payload + ?Sized>(
         &mut self,
         sensor: &str,

@@ -148,9 +148,10 @@ impl fmt::Display for Silence {
     }
 }
 
-/// Finds the reason for the silence of one topic of one sensor. It follows the sensor's status only while it is used.
+/// Finds the reason for the silence of one topic of one sensor. From the first call of
+/// [`Source::why_silent`](crate::streams::Source::why_silent) on, it subscribes to the sensor's status.
 #[derive(Default)]
-pub(crate) struct SilenceCheck {
+pub struct SilenceCheck {
     status: Option<Box<(Follower<Status>, Option<Status>)>>,
 }
 
@@ -194,8 +195,8 @@ impl SilenceCheck {
         last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
     }
 
-    /// Stops following the status, because a sample has arrived.
-    pub(crate) fn end(&mut self) {
+    /// Ends the subscription to the status. Call it when a sample has arrived.
+    pub fn end(&mut self) {
         self.status = None;
     }
 }

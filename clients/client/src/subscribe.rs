@@ -61,8 +61,7 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     ///
     /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived.
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers have run
-    /// out. [`ErrorKind::Failed`](crate::ErrorKind) if the domain belongs to another user, or the topic has another
-    /// layout.
+    /// out. [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
     #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
     pub fn next(&mut self) -> Result<Option<Received<P>>, Error> {
         // A timeout beyond all time is none.
@@ -166,7 +165,7 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     /// }
     /// ```
     pub fn why_silent(&mut self) -> Silence {
-        self.silence.reason(&mut self.session, &self.follower)
+        self.follower.why_silent(&mut self.session, &mut self.silence)
     }
 
     fn look(&mut self) -> Result<Option<Received<P>>, Error> {

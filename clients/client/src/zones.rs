@@ -117,7 +117,7 @@ impl ZonesSubscriber {
 
     /// Returns why no zones arrive, as [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
     pub fn why_silent(&mut self) -> Silence {
-        self.silence.reason(&mut self.session, &self.source.follower)
+        self.source.why_silent(&mut self.session, &mut self.silence)
     }
 
     /// Returns the news, if there are any since the last call; never waits.
@@ -171,6 +171,11 @@ impl ZonesSource {
     /// Returns whether the topic has been there at least once.
     pub fn subscribed(&self) -> bool {
         self.follower.subscribed()
+    }
+
+    /// Returns why no zones are received. Never waits.
+    pub(crate) fn why_silent(&self, session: &mut Session, check: &mut SilenceCheck) -> Silence {
+        check.reason(session, &self.follower)
     }
 
     /// Returns whether the first sample has arrived, or its deadline has passed.

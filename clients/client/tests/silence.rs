@@ -5,9 +5,10 @@ mod fake;
 use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
-use scanhub_client::{Marks, Scan, Silence, Subscriber, ZonesSubscriber};
+use scanhub_client::streams::find;
+use scanhub_client::{ErrorKind, Marks, Publication, Scan, Silence, Subscriber, Tilt, ZonesSubscriber};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{State, Topic};
+use scanhub_schema::{Failure, Kind, State, Topic};
 use scanhub_shm::{Payload, PortFactory};
 
 fn scans(place: &Place, sensor: &str) -> Subscriber<Scan> {
@@ -134,6 +135,11 @@ fn a_domain_of_another_user_is_named() {
     assert!(matches!(silence, Silence::OtherUser { .. }), "{silence:?}");
     assert!(silence.to_string().contains("belongs to user"), "{silence}");
     assert!(silence.remedy().contains("run as user"), "{}", silence.remedy());
+    let error = find(std::slice::from_ref(&place.domain)).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::OtherUser, "{error}");
+    assert_eq!(Failure::from(error).kind, Kind::NoHub, "the exit code is that of a missing hub");
+    let error = Publication::<Tilt>::in_domain(&place.domain, "mount").err();
+    assert_eq!(error.map(|error| error.kind()), Some(ErrorKind::OtherUser));
 }
 
 #[test]

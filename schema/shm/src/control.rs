@@ -50,7 +50,7 @@ impl ControlServer {
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if memory or descriptors are short, or if another hub is its server, and
-    /// [`Kind::Failed`] if the service has another layout.
+    /// [`Kind::Incompatible`] if the service has another layout.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
         let service = name(CONTROL)?;
         let control = create(node, &service, || {

@@ -184,7 +184,7 @@ impl Directory {
         }
         if stat.st_uid != user() {
             let what = format!("belongs to user {}", named(stat.st_uid));
-            return Err(self.purpose.planted(&path, &what));
+            return Err(Failure { kind: Kind::OtherUser, ..self.purpose.planted(&path, &what) });
         }
         Ok(File::from(fd))
     }
@@ -246,7 +246,7 @@ impl Purpose {
                     ),
                     Purpose::State => format!("run as user {owner}, with sudo without -E, or {SET_STATE}"),
                 };
-                Failure::new(Kind::Failed, what, hint)
+                Failure::new(Kind::OtherUser, what, hint)
             }
             WalkError::Writable(path, mode) => {
                 let (path, mode) = (path.display(), mode & 0o7777);

@@ -102,8 +102,9 @@ pub fn strangers(root: &Path) -> Vec<Segment> {
 pub(crate) fn in_the_way(segment: &Segment) -> Failure {
     let (path, owner, mode) = (segment.path.display(), named(segment.owner), segment.mode);
     let is_file = if segment.is_file { "" } else { " and is no file" };
+    let own = rustix::process::geteuid().as_raw();
     Failure::new(
-        Kind::Failed,
+        if segment.owner == own { Kind::Failed } else { Kind::OtherUser },
         format!(
             "{path} belongs to user {owner} with mode {mode:04o}{is_file}: it is in the way, and is not opened"
         ),

@@ -33,6 +33,8 @@ pub(crate) enum OpenFailure {
     Absent,
     /// There is no place for another process.
     Full,
+    /// The service has another layout, or another version of iceoryx2.
+    Incompatible(&'static str),
     /// A retry does not help.
     Broken(String),
 }
@@ -47,9 +49,9 @@ impl From<ServiceOpenError> for OpenFailure {
             // This happens while the hub creates the service or cleans up after a dead process.
             E::ServiceInCorruptedState => OpenFailure::Absent,
             E::ExceedsMaxNumberOfNodes => OpenFailure::Full,
-            E::VersionMismatch => OpenFailure::Broken("the hub has another version of iceoryx2".into()),
+            E::VersionMismatch => OpenFailure::Incompatible("the hub has another version of iceoryx2"),
             E::IncompatiblePayload | E::IncompatibleMessagingPattern => {
-                OpenFailure::Broken("the hub uses another layout".into())
+                OpenFailure::Incompatible("the hub uses another layout")
             }
             other => OpenFailure::Broken(format!("{other:?}")),
         }
@@ -244,6 +246,10 @@ pub(crate) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
 }
 
 fn failure<S: Service>(node: &Node<S>, service: &ServiceName, failed: OpenFailure) -> Failure {
+    let in_domain = |what: &str| {
+        let root = node.config().global.root_path().to_string();
+        access_failure(Path::new(&root), format!("{service}: {what}"))
+    };
     match failed {
         OpenFailure::Full => Failure::new(
             Kind::Short,
@@ -253,9 +259,10 @@ fn failure<S: Service>(node: &Node<S>, service: &ServiceName, failed: OpenFailur
         OpenFailure::Absent => {
             Failure::new(Kind::Failed, format!("{service} cannot be created"), "remove what is left of it")
         }
-        OpenFailure::Broken(what) => {
-            let root = node.config().global.root_path().to_string();
-            access_failure(Path::new(&root), format!("{service}: {what}"))
-        }
+        OpenFailure::Incompatible(what) => match in_domain(what) {
+            failure if failure.kind == Kind::Failed => Failure { kind: Kind::Incompatible, ..failure },
+            failure => failure,
+        },
+        OpenFailure::Broken(what) => in_domain(&what),
     }
 }

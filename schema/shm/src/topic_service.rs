@@ -50,7 +50,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it exists with another
+    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if it exists with another
     /// layout.
     fn create<S: Service>(
         node: &Node<S>,
@@ -62,7 +62,7 @@ pub trait Payload: sealed::Sealed + Debug + 'static {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it has another layout.
+    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if it has another layout.
     fn open<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<TopicService<Self, S>>, Failure>;
 
     /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
@@ -358,7 +358,7 @@ impl<P: Payload + ?Sized, S: Service> SharedMemory<P, S> {
     /// # Errors
     ///
     /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::Short`] if memory or descriptors
-    /// are short, and [`Kind::Failed`] if the topic exists with another layout.
+    /// are short, and [`Kind::Incompatible`] if the topic exists with another layout.
     pub fn new(node: &Node<S>, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
         let service = P::create(node, sensor, limits)?;
         Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })

@@ -45,7 +45,7 @@ impl<S: Service> Waker<S> {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Short`] if memory is short, and [`Kind::Failed`] if the service has another layout.
+    /// Returns [`Kind::Short`] if memory is short, and [`Kind::Incompatible`] if the service has another layout.
     pub fn new(node: &Node<S>, sensor: &str) -> Result<Waker<S>, Failure> {
         let ringer = DoorbellRinger::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
@@ -135,7 +135,8 @@ fn create_service<S: Service>(node: &Node<S>, sensor: &str) -> Result<WakeServic
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the service has another layout.
+/// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Incompatible`] if the service has another
+/// layout.
 pub fn open_wake<S: Service>(node: &Node<S>, sensor: &str) -> Result<Option<WakeService<S>>, Failure> {
     open_event(node, &Wake::service(sensor))
 }

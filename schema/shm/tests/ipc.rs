@@ -291,3 +291,14 @@ fn the_librarys_version_is_the_one_that_is_built_with() {
     let version = pinned.and_then(|rest| rest.split('"').next()).expect("it is pinned");
     assert_eq!(scanhub_shm::LIBRARY, format!("iceoryx2 {version}"));
 }
+
+#[test]
+fn a_topic_with_another_layout_is_incompatible() {
+    let place = Place::new();
+    let hub = scanhub_shm::hub_node(&place.domain).unwrap();
+    let service = Topic::Scan.service("front").as_str().try_into().unwrap();
+    let _other = hub.service_builder(&service).publish_subscribe::<u64>().create().unwrap();
+    let failure = Scan::open(&hub, "front").expect_err("its samples are numbers");
+    assert_eq!(failure.kind, Kind::Incompatible, "{failure}");
+    assert!(failure.message.ends_with("the hub uses another layout"), "{failure}");
+}
