@@ -1,8 +1,8 @@
 //! The only contact with the client library: subscriptions to several topics or to the verdict of a robot, and the samples
 //! that a program keeps.
 //!
-//! A program may use a subscription, and drop its samples, in any thread. So a subscription and all samples that it received
-//! are behind one mutex.
+//! A program may use a subscription, and drop its samples, in any thread. Both are `Send` and not `Sync`, so each is behind a
+//! mutex.
 #![allow(unsafe_code)]
 
 use std::mem;
@@ -14,12 +14,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, find};
+use scanhub_client::streams::{Change, Sample as AnySample, Session, SilenceCheck, Source, find};
 use scanhub_client::{
-    Domain, Environment, ErrorKind, Header, Pollable, Publication, Robot, RobotSubscriber, SubscriberBuilder,
-    Tilt, Topic, Wait,
+    Domain, Environment, ErrorKind, Header, Pollable, Publication, Robot, RobotSubscriber, Silence,
+    SubscriberBuilder, Tilt, Topic, Wait,
 };
-use scanhub_schema::{Failure, limits};
+use scanhub_schema::Failure;
 
 use crate::error::Error;
 use crate::sample::{Memory, Sample};
@@ -29,8 +29,11 @@ type ClientError = scanhub_client::Error;
 /// Maximum time of one wait. After it, the caller handles signals.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
 
-/// Time without a first sample after which the program gets a warning, if there is no hub or a topic is missing.
+/// Time without a first sample after which the program gets a warning, if there is a reason for the silence.
 const WARN_AFTER: Duration = Duration::from_secs(2);
+
+/// Interval of the checks for the reason, after the first one has found none.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Topic of a sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -56,7 +59,7 @@ impl Place {
 
     /// Returns the location of the running hub.
     pub(crate) fn live(&self) -> Result<Domain, Error> {
-        find(&self.candidates()?).map_err(Error::of_hub)
+        Ok(find(&self.candidates()?)?)
     }
 
     /// Returns the location in which a program publishes.
@@ -111,13 +114,6 @@ impl<T> Confined<T> {
         if self.is_own() { self.lock().as_mut().map(apply) } else { None }
     }
 
-    /// Calls `apply` with the value, unless another thread uses it.
-    fn try_with(&self, apply: impl FnOnce(&mut T)) {
-        if let Ok(mut value) = self.value.try_lock() {
-            value.as_mut().map(apply);
-        }
-    }
-
     /// Takes the value, if this process created it.
     pub(crate) fn take(&self) -> Option<T> {
         if self.is_own() { self.lock().take() } else { None }
@@ -151,7 +147,7 @@ pub(crate) trait Follow: Sized + Send {
     type Item;
 
     /// Returns the next item that has arrived.
-    fn try_next(this: &Arc<Confined<Self>>) -> Result<Option<Self::Item>, Error>;
+    fn try_next(&mut self) -> Result<Option<Self::Item>, Error>;
 
     /// Sleeps until an item may have arrived, at most for `longest` and 0.1 s.
     fn wait(&mut self, longest: Duration) -> Result<(), Error>;
@@ -168,18 +164,26 @@ pub(crate) trait Follow: Sized + Send {
     /// Returns whether a hub or listener publishes in the domain, as of the last look.
     fn hub_lives(&self) -> bool;
 
+    /// Returns the time since the last sample; if there was none, since the start. Time in suspend counts.
+    fn silent_for(&self) -> Duration;
+
     /// Returns the changes of the hub since the last call, oldest first.
     fn notices(&mut self) -> Vec<&'static str> {
         Vec::new()
     }
 
-    /// Returns the reason why nothing was received, once after [`WARN_AFTER`].
+    /// Returns the time until [`warning`](Self::warning) must be called, if it may return something.
+    fn warning_due(&self) -> Option<Duration> {
+        None
+    }
+
+    /// Returns the reason why nothing was received, once and after [`WARN_AFTER`].
     fn warning(&mut self) -> Option<Error> {
         None
     }
 
-    /// Returns the error after a silence of `timeout`.
-    fn silence(&self, timeout: f64) -> Error {
+    /// Returns the error after a silence of `timeout` seconds.
+    fn silence(&mut self, timeout: f64) -> Error {
         Error::new("Silent", format!("no verdict in {timeout} s"), "")
     }
 }
@@ -187,57 +191,48 @@ pub(crate) trait Follow: Sized + Send {
 /// Subscription to one or more topics.
 pub(crate) struct Topics {
     session: Session,
-    places: Vec<Domain>,
     sources: Vec<Followed>,
     /// Index of the source that is next in the round, so that no topic waits for the samples of another one.
     turn: usize,
     wait: Option<Wait>,
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
-    /// Samples that the program keeps, with the indexes of their sources.
-    kept: Vec<Option<(usize, AnySample)>>,
-    /// Indexes of the kept samples that the program has dropped.
-    dropped: Arc<Mutex<Vec<usize>>>,
     notices: Vec<&'static str>,
-    /// Time of the first look; `None` before it, and after the first sample or the warning.
-    silent_since: Option<Instant>,
+    /// Time of the next check for a warning; `None` before the first look, and after the first sample or the warning.
+    warn_at: Option<Instant>,
     has_left: bool,
 }
 
 struct Followed {
     name: Name,
     source: Source,
+    silence: SilenceCheck,
     last: Header,
     is_first: bool,
 }
 
 impl Topics {
     pub(crate) fn new(names: Vec<Name>, place: &Place) -> Result<Topics, Error> {
-        let places = place.candidates()?;
         let sources = names.into_iter().map(|name| {
             let source = Source::new(&name.sensor, name.topic);
-            Followed { name, source, last: Header::default(), is_first: true }
+            Followed {
+                name,
+                source,
+                silence: SilenceCheck::default(),
+                last: Header::default(),
+                is_first: true,
+            }
         });
         Ok(Topics {
-            session: Session::new(places.clone()),
-            places,
+            session: Session::new(place.candidates()?),
             sources: sources.collect(),
             turn: 0,
             wait: None,
             descriptor: None,
-            kept: Vec::new(),
-            dropped: Arc::default(),
             notices: Vec::new(),
-            silent_since: None,
+            warn_at: None,
             has_left: false,
         })
-    }
-
-    /// Gives the samples back to the hub that the program has dropped.
-    fn give_back(&mut self) {
-        for number in self.dropped.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
-            self.kept[number] = None;
-        }
     }
 
     fn look_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
@@ -249,10 +244,11 @@ impl Topics {
             let Change { gone, back } = self.session.look()?;
             self.notices.extend(gone.map(|_| "hub_gone"));
             self.notices.extend(back.map(|_| "hub_back"));
-            if self.session.domain().is_none()
-                && let Some(denied) = Error::denied(self.session.no_hub_here())
-            {
-                return Err(denied);
+            if self.session.domain().is_none() {
+                let error = self.session.no_hub_here();
+                if error.kind() == ErrorKind::OtherUser {
+                    return Err(error.into());
+                }
             }
             if let Some(received) = self.receive(false)? {
                 return Ok(Some(received));
@@ -274,7 +270,7 @@ impl Topics {
             match source.receive(&mut self.session) {
                 Ok(None) => {}
                 Ok(Some(sample)) => return Ok(Some((index, sample))),
-                Err(_) if self.kept_of(index) >= limits::BORROWED => {
+                Err(ClientError::TooManyHeld) => {
                     let Name { sensor, topic } = &self.sources[index].name;
                     let what = format!(
                         "four samples of {sensor}/{} are kept, and no more are possible",
@@ -286,23 +282,30 @@ impl Topics {
                         "drop them and their views, or keep `sample.copy()`",
                     ));
                 }
-                Err(failure) => return Err(failure.into()),
+                Err(error) => return Err(error.into()),
             }
         }
         Ok(None)
     }
 
-    fn kept_of(&self, source: usize) -> usize {
-        self.kept.iter().flatten().filter(|(of, _)| *of == source).count()
+    /// Returns the reasons for the silence, each once. Empty if nothing is wrong.
+    fn why_silent(&mut self) -> Vec<Silence> {
+        let mut reasons = Vec::new();
+        for Followed { source, silence, .. } in &mut self.sources {
+            match source.why_silent(&mut self.session, silence) {
+                Silence::Waiting => {}
+                // It is the reason for all of them.
+                reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
+                reason if reasons.contains(&reason) => {}
+                reason => reasons.push(reason),
+            }
+        }
+        reasons
     }
 
-    fn keep(&mut self, source: usize, sample: AnySample) -> usize {
-        let free = self.kept.iter().position(Option::is_none).unwrap_or_else(|| {
-            self.kept.push(None);
-            self.kept.len() - 1
-        });
-        self.kept[free] = Some((source, sample));
-        free
+    /// Sets the method of waiting with the first look.
+    fn begin(&mut self, wait: Wait) {
+        (self.wait, self.warn_at) = (Some(wait), Some(Instant::now() + WARN_AFTER));
     }
 
     fn left(&self) -> Option<Duration> {
@@ -324,16 +327,16 @@ impl Follow for Topics {
         self.has_left
     }
 
-    fn try_next(this: &Arc<Confined<Topics>>) -> Result<Option<Sample>, Error> {
-        let mut value = this.lock();
-        let Some(topics) = value.as_mut() else { return Ok(None) };
-        if topics.wait.is_none() {
-            (topics.wait, topics.silent_since) = (Some(Wait::Doorbell), Some(Instant::now()));
+    fn try_next(&mut self) -> Result<Option<Sample>, Error> {
+        if self.wait.is_none() {
+            self.begin(Wait::Doorbell);
         }
-        topics.give_back();
-        let Some((index, sample)) = topics.look_and_receive()? else { return Ok(None) };
-        topics.silent_since = None;
-        let followed = &mut topics.sources[index];
+        let Some((index, sample)) = self.look_and_receive()? else { return Ok(None) };
+        if !sample.is_silence() {
+            self.warn_at = None;
+            self.sources.iter_mut().for_each(|followed| followed.silence.end());
+        }
+        let followed = &mut self.sources[index];
         let header = sample.header().copied();
         let restarted = header.is_some_and(|header| !followed.is_first && header.boot != followed.last.boot);
         if let Some(header) = header {
@@ -354,9 +357,7 @@ impl Follow for Topics {
                         | AnySample::Background(_)
                         | AnySample::Cloud(_)
                 );
-                let number = topics.keep(index, sample);
-                let dropped = Arc::clone(&topics.dropped);
-                Memory::Hub(Held { address, len, is_of_words, number, dropped, of: Arc::clone(this) })
+                Memory::Hub(Held { address, len, is_of_words, _sample: Confined::new(sample) })
             }
         };
         Ok(Some(Sample { name, header, missed, restarted, stale, memory: Arc::new(memory) }))
@@ -370,8 +371,7 @@ impl Follow for Topics {
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
             self.descriptor = Some(self.session.pollable()?);
-            self.wait = Some(Wait::Event);
-            self.silent_since = Some(Instant::now());
+            self.begin(Wait::Event);
         }
         self.descriptor.as_ref().map(|descriptor| descriptor.as_raw_fd()).ok_or_else(Error::mixed)
     }
@@ -384,52 +384,52 @@ impl Follow for Topics {
         mem::take(&mut self.notices)
     }
 
-    fn warning(&mut self) -> Option<Error> {
-        self.silent_since.take_if(|since| since.elapsed() >= WARN_AFTER)?;
-        let is_missing = self.sources.iter().any(|followed| !followed.source.subscribed());
-        (self.session.domain().is_none() || is_missing).then(|| self.silence(WARN_AFTER.as_secs_f64()))
+    fn silent_for(&self) -> Duration {
+        self.session.silent_for()
     }
 
-    fn silence(&self, timeout: f64) -> Error {
-        if self.session.domain().is_none() {
-            return Error::of_hub(self.session.no_hub());
+    fn warning_due(&self) -> Option<Duration> {
+        self.warn_at.map(|at| at.saturating_duration_since(Instant::now()))
+    }
+
+    fn warning(&mut self) -> Option<Error> {
+        let now = Instant::now();
+        self.warn_at.take_if(|at| *at <= now)?;
+        let reason = Error::of_silence(&self.why_silent());
+        if reason.is_none() {
+            self.warn_at = Some(now + CHECK_INTERVAL);
         }
-        let names = |is_listed: fn(&&Followed) -> bool| {
-            let names = self
-                .sources
-                .iter()
-                .filter(is_listed)
-                .map(|followed| format!("{}/{}", followed.name.sensor, followed.name.topic.name()));
-            let mut names: Vec<String> = names.collect();
-            names.sort();
-            names.join(", ")
-        };
-        let missing = names(|followed| !followed.source.subscribed());
-        if !missing.is_empty() {
-            let topics = scanhub_client::live_topics(&self.places).join(", ");
-            let topics = if topics.is_empty() { "no topics at all" } else { &topics };
-            return Error::new(
-                "Silent",
-                format!("no {missing} in {timeout} s"),
-                format!("the hub has {topics}"),
-            );
+        reason
+    }
+
+    fn silence(&mut self, timeout: f64) -> Error {
+        let reason = Error::of_silence(&self.why_silent());
+        let names = self
+            .sources
+            .iter()
+            .map(|Followed { name: Name { sensor, topic }, .. }| format!("{sensor}/{}", topic.name()));
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        let what = format!("nothing of {} in {timeout} s", names.join(", "));
+        match reason {
+            Some(reason) if reason.class == "Silent" => reason.after(&what),
+            Some(reason) => reason,
+            None => {
+                let sensor = self.sources.first().map_or("SENSOR", |followed| &followed.name.sensor);
+                Error::new("Silent", what, format!("`scanhub info {sensor}` shows the sensor's state"))
+            }
         }
-        let sensor = self.sources.first().map_or("SENSOR", |followed| &followed.name.sensor);
-        let remedy = format!("`scanhub info {sensor}` shows the sensor's state");
-        Error::new("Silent", format!("nothing of {} in {timeout} s", names(|_| true)), remedy)
     }
 }
 
-/// Payload of a sample in shared memory. The sample is given back to the hub when this is dropped.
+/// Payload of a sample in shared memory. The sample is released when this is dropped, except in a child after `fork`.
 pub(crate) struct Held {
     /// Address of the payload.
     address: usize,
     len: usize,
     /// Whether the payload has a variable length.
     is_of_words: bool,
-    number: usize,
-    dropped: Arc<Mutex<Vec<usize>>>,
-    of: Arc<Confined<Topics>>,
+    _sample: Confined<AnySample>,
 }
 
 impl Held {
@@ -441,19 +441,9 @@ impl Held {
     /// Returns the used bytes, and those that fill the last word of a payload of variable length.
     pub(crate) fn words(&self) -> &[u8] {
         let len = if self.is_of_words { self.len.next_multiple_of(8) } else { self.len };
-        // SAFETY: `of` keeps the sample until `self` is dropped. Until then, its payload in shared memory does not move, and
+        // SAFETY: `_sample` is kept until `self` is dropped. Until then, its payload in shared memory does not move, and
         // the hub does not write it. A payload of variable length consists of whole words of 8 bytes.
         unsafe { std::slice::from_raw_parts(ptr::with_exposed_provenance(self.address), len) }
-    }
-}
-
-impl Drop for Held {
-    fn drop(&mut self) {
-        if self.of.is_own() {
-            self.dropped.lock().unwrap_or_else(PoisonError::into_inner).push(self.number);
-            // A thread that waits gives it back after the wait.
-            self.of.try_with(Topics::give_back);
-        }
     }
 }
 
@@ -498,7 +488,7 @@ impl Verdicts {
 
     fn subscriber(&mut self) -> Option<&mut RobotSubscriber> {
         match &mut self.pollable {
-            Some(pollable) => Some(pollable.get_mut()),
+            Some(pollable) => Some(pollable.subscriber_mut()),
             None => self.robot.as_mut(),
         }
     }
@@ -515,11 +505,9 @@ impl Follow for Verdicts {
         self.robot.is_none() && self.pollable.is_none()
     }
 
-    fn try_next(this: &Arc<Confined<Verdicts>>) -> Result<Option<Verdict>, Error> {
-        let mut value = this.lock();
-        let Some(verdicts) = value.as_mut() else { return Ok(None) };
-        verdicts.wait = verdicts.wait.or(Some(Wait::Doorbell));
-        let Some(robot) = verdicts.subscriber() else { return Ok(None) };
+    fn try_next(&mut self) -> Result<Option<Verdict>, Error> {
+        self.wait = self.wait.or(Some(Wait::Doorbell));
+        let Some(robot) = self.subscriber() else { return Ok(None) };
         Ok(robot.try_next()?.map(verdict))
     }
 
@@ -543,6 +531,13 @@ impl Follow for Verdicts {
         match &self.pollable {
             Some(pollable) => pollable.hub_is_running(),
             None => self.robot.as_ref().is_some_and(RobotSubscriber::hub_is_running),
+        }
+    }
+
+    fn silent_for(&self) -> Duration {
+        match &self.pollable {
+            Some(pollable) => pollable.silent_for(),
+            None => self.robot.as_ref().map(RobotSubscriber::silent_for).unwrap_or_default(),
         }
     }
 }
@@ -570,7 +565,7 @@ pub(crate) struct Mount(Publication<Tilt>);
 
 impl Mount {
     pub(crate) fn new(name: &str, place: &Place) -> Result<Mount, Error> {
-        Publication::in_domain(&place.home()?, name).map(Mount).map_err(Error::of_name)
+        Ok(Mount(Publication::in_domain(&place.home()?, name)?))
     }
 
     /// Publishes the angle at `stamp_ns` of CLOCK_MONOTONIC. `None` means now.
@@ -604,7 +599,6 @@ impl From<Failure> for Error {
 
 impl From<ClientError> for Error {
     fn from(error: ClientError) -> Error {
-        let message = error.message();
         let class = match error.kind() {
             ErrorKind::NoHub => "NoHub",
             ErrorKind::NoTopic => "NoTopic",
@@ -612,36 +606,27 @@ impl From<ClientError> for Error {
             ErrorKind::InvalidInput => "Impossible",
             ErrorKind::NameHeld | ErrorKind::DomainHeld => "Taken",
             ErrorKind::Timeout => "Silent",
-            // The client library has no kinds for these yet.
-            _ if message.contains("belongs to user") => "Denied",
-            _ if message.contains("another layout") || message.contains("iceoryx2") => "Mismatch",
+            ErrorKind::OtherUser => "Denied",
+            ErrorKind::Incompatible => "Mismatch",
+            ErrorKind::TooManyHeld => "Held",
             _ => "Failure",
         };
-        Error::new(class, message, error.remedy())
+        Error::new(class, error.message(), error.remedy())
     }
 }
 
 impl Error {
-    /// Returns the error for a hub that was not found.
-    pub(crate) fn of_hub(error: ClientError) -> Error {
-        match error.message().contains("belongs to user") {
-            true => Error::new("Denied", error.message(), error.remedy()),
-            false => error.into(),
-        }
-    }
-
-    /// Returns the error for a domain that belongs to another user. `None` for another failure.
-    fn denied(error: ClientError) -> Option<Error> {
-        let error = Error::of_hub(error);
-        (error.class == "Denied").then_some(error)
-    }
-
-    /// Returns the error for a name under which the program cannot publish.
-    fn of_name(error: ClientError) -> Error {
-        match error.message().contains("is published by") {
-            true => Error::new("Taken", error.message(), error.remedy()),
-            false => error.into(),
-        }
+    /// Returns the error for a silence with these reasons. `None` without a reason.
+    fn of_silence(reasons: &[Silence]) -> Option<Error> {
+        let class = match reasons.first()? {
+            Silence::NoHub { .. } | Silence::OtherUser { .. } => "NoHub",
+            Silence::Full { .. } => "Short",
+            _ => "Silent",
+        };
+        let messages: Vec<String> = reasons.iter().map(Silence::to_string).collect();
+        let mut remedies: Vec<String> = reasons.iter().map(Silence::remedy).collect();
+        remedies.dedup();
+        Some(Error::new(class, messages.join("; "), remedies.join("; ")))
     }
 
     /// Returns the error for a request that the hub refused.

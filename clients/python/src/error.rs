@@ -18,9 +18,12 @@ impl Error {
     pub(crate) fn new(class: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Error {
         Error { class, message: message.into(), remedy: remedy.into() }
     }
-}
 
-impl Error {
+    /// Returns this error with `what` before its message.
+    pub(crate) fn after(self, what: &str) -> Error {
+        Error { message: format!("{what}: {}", self.message), ..self }
+    }
+
     /// Warns the program with `SilenceWarning`. Fails if warnings are errors.
     pub(crate) fn warn(&self, py: Python<'_>) -> PyResult<()> {
         let text = format!("nothing yet: {}\n  {}", self.message, self.remedy);

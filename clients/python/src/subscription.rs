@@ -34,7 +34,7 @@ fn next<F: Follow<Item: Send> + 'static>(
         }
         let waited = py.detach(|| {
             this.with(|follower| follower.wait(left)).transpose()?;
-            F::try_next(this)
+            Ok::<_, Error>(this.with(F::try_next).transpose()?.flatten())
         });
         item = waited?;
         notify(py, this, notice)?;
@@ -54,7 +54,7 @@ fn poll<F: Follow>(
     if !is_open(this) {
         return Ok(None);
     }
-    let item = F::try_next(this)?;
+    let item = this.with(F::try_next).transpose()?.flatten();
     notify(py, this, notice)?;
     if item.is_none() {
         warn(py, this)?;
@@ -115,6 +115,18 @@ macro_rules! follower {
             #[getter]
             fn hub_lives(&self) -> bool {
                 self.source.with(|source| source.hub_lives()).unwrap_or_default()
+            }
+
+            /// Seconds since the last sample; if there was none, since the start. Time in suspend counts.
+            fn silent_for(&self, py: Python<'_>) -> Result<f64, Error> {
+                let silent_for = |source: &mut _| (!Follow::has_left(source)).then(|| Follow::silent_for(source));
+                let silent_for = py.detach(|| self.source.with(silent_for)).flatten();
+                silent_for.map(|time| time.as_secs_f64()).ok_or_else(closed)
+            }
+
+            #[getter]
+            fn _warning_due(&self) -> Option<f64> {
+                self.source.with(|source| source.warning_due()).flatten().map(|time| time.as_secs_f64())
             }
 
             #[getter]

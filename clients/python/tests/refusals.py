@@ -1,5 +1,6 @@
 """What cannot be followed, and what is said of it: arguments are domain and root, of which nobody else knows."""
 
+import asyncio
 import fcntl
 import os
 import resource
@@ -64,11 +65,11 @@ def somebody_elses_domain() -> None:
 
 
 def hub_without_topics() -> int:
-    """Holds the lock of a hub, with its process ID."""
+    """Holds the lock of a hub that has created all of its topics."""
     os.makedirs(place, mode=0o700, exist_ok=True)
     lock = os.open(f"{place}/hub.lock", os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.fcntl(lock, fcntl.F_OFD_SETLK, struct.pack("hhqqi0q", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
-    os.write(lock, b"%d\n" % os.getpid())
+    os.write(lock, b"%d\nready\n" % os.getpid())
     return lock
 
 
@@ -77,7 +78,12 @@ def silence() -> None:
     with publish("other"):
         assert scanhub.topics(domain=domain, root=root) == [("other", "tilt")]
         said = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
-        assert "front/marks, rear/scan" in said.message and "other/tilt" in said.remedy, said
+        assert "front/marks, rear/scan in 0.3 s: the hub has no sensor front; the hub has no sensor rear" in said.message, said
+        assert said.remedy == "the sensors are other", said
+        said = refusal(scanhub.Silent, lambda: follow("other/scan", timeout=0.3))
+        assert "does not publish other/scan" in said.message and "the topics are tilt" in said.remedy, said
+        said = refusal(scanhub.Silent, lambda: follow("other/tilt", timeout=0.3))
+        assert said.message == "nothing of other/tilt in 0.3 s" and "scanhub info other" in said.remedy, said
         said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))
         assert "takes no requests" in said.message, said
     os.close(lock)
@@ -95,7 +101,44 @@ def reasons_of_a_silence() -> None:
         (warning,) = caught
         assert warning.category is scanhub.SilenceWarning and warning.filename == __file__, warning
         said = str(warning.message)
-        assert ("othr/tilt" in said and "other/tilt" in said) if other_domain == domain else "scanhub run" in said, said
+        words = ("no sensor othr", "the sensors are other") if other_domain == domain else ("nothing yet: no hub", "scanhub run")
+        assert all(word in said for word in words), said
+    os.close(lock)
+
+
+def warnings_in_asyncio() -> None:
+    async def follow() -> None:
+        with scanhub.subscribe("front/scan", domain="nowhere", root=root) as silent:
+            await silent.__anext__()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", scanhub.SilenceWarning)
+        try:
+            asyncio.run(asyncio.wait_for(follow(), 20))
+        except scanhub.SilenceWarning as warning:
+            assert "scanhub run" in str(warning), warning
+        else:
+            raise AssertionError("nothing can be received")
+
+
+def duration_of_a_silence() -> None:
+    lock = hub_without_topics()
+    with publish("other") as mount, scanhub.subscribe("other/tilt", domain=domain, root=root, timeout=0.1) as tilts:
+        refusal(scanhub.Silent, lambda: next(tilts))
+        before = tilts.silent_for()
+        assert 0.1 <= before < 60, before
+        assert mount.subscribers == 1
+        begin = time.monotonic()
+        mount.send(angle_rad=0.25)
+        next(tilts)
+        assert tilts.silent_for() <= time.monotonic() - begin
+        time.sleep(0.05)
+        assert tilts.silent_for() >= 0.05
+    said = refusal(scanhub.Failure, tilts.silent_for)
+    assert "closed" in said.message, said
+    with scanhub.robot(domain=domain, root=root) as robot:
+        time.sleep(0.02)
+        assert robot.silent_for() >= 0.02
     os.close(lock)
 
 
@@ -129,6 +172,16 @@ def a_taken_name() -> None:
 
 domain, root = sys.argv[1:]
 place = os.path.join(root, domain)
-for check in (names_that_are_none, no_hub, somebody_elses_domain, a_taken_name, silence, reasons_of_a_silence, what_is_short):
+for check in (
+    names_that_are_none,
+    no_hub,
+    somebody_elses_domain,
+    a_taken_name,
+    silence,
+    reasons_of_a_silence,
+    warnings_in_asyncio,
+    duration_of_a_silence,
+    what_is_short,
+):
     check()
     print(check.__name__, flush=True)

@@ -141,7 +141,10 @@ async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any
             return item
         if until is not None and loop.time() >= until:
             raise follower._silence()
-        await _readable(loop, descriptor, until)
+        # Without a hub, the descriptor may never be readable, but the warning is due.
+        due = follower._warning_due
+        ends = [end for end in (until, None if due is None else loop.time() + due) if end is not None]
+        await _readable(loop, descriptor, min(ends, default=None))
     raise StopAsyncIteration
 
 

@@ -16,7 +16,8 @@ class Failure(Exception):
 
 
 class SilenceWarning(UserWarning):
-    """Nothing was received for two seconds after the start, because there is no hub or a topic is missing."""
+    """Nothing was received for two seconds after the start. The text names the reason: there is no hub, a sensor or topic is
+    missing, or a scanner is paused or absent."""
 
 
 class NoHub(Failure):
