@@ -14,6 +14,7 @@ use crate::client::{Held, Name};
 use crate::topics;
 
 /// Payload of a sample.
+#[expect(clippy::large_enum_variant, reason = "it is always behind an `Arc`")]
 pub(crate) enum Memory {
     /// In shared memory.
     Hub(Held),

@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 
 import numpy as np
 import scanhub
@@ -39,11 +40,20 @@ def models_are_shown_and_ordered() -> None:
 def the_flow_is_ordered() -> None:
     scanhub.control("front", "pause", domain=domain, root=root)
     until(lambda: state() == "paused")
-    try:
-        next(scanhub.subscribe("front/scan", domain=domain, root=root, timeout=0.5))
-        raise AssertionError("it is paused")
-    except scanhub.Silent as silent:
-        assert "front/scan" in silent.message and "scanhub info front" in silent.remedy
+    paused = scanhub.subscribe("front/scan", domain=domain, root=root, timeout=0.5)
+
+    def reason() -> "tuple[str, str]":
+        try:
+            next(paused)
+            raise AssertionError("it is paused")
+        except scanhub.Silent as silent:
+            return silent.message, silent.remedy
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        until(lambda: reason() == ("nothing of front/scan in 0.5 s: front is paused", "scanhub resume front") and caught)
+    assert str(caught[0].message) == "nothing yet: front is paused\n  scanhub resume front", caught[0]
+    assert len(caught) == 1 and paused.silent_for() >= 2
     scanhub.control("front", "resume", domain=domain, root=root)
     until(lambda: state() == "streaming")
 
