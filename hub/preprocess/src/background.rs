@@ -16,6 +16,7 @@ use scanhub_schema::{
 use fixed::{BLOCK, Multi, Paper};
 use moving::Moving;
 
+use crate::search::position;
 use crate::velocity::Velocity;
 
 /// Settings of a background.
@@ -451,20 +452,6 @@ fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) 
 
 fn is_foreground(class: Class) -> bool {
     class == Class::Foreground
-}
-
-/// Returns the index of the first value from `from` on that `is_it`. Such values are rare, so whole blocks are
-/// compared, without a branch for each value.
-pub(crate) fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
-    const BLOCK: usize = 32;
-    let mut begin = from;
-    while let Some(block) = values[begin..].first_chunk::<BLOCK>() {
-        if block.iter().fold(false, |any, &value| any | is_it(value)) {
-            break;
-        }
-        begin += BLOCK;
-    }
-    values[begin..].iter().position(|&value| is_it(value)).map(|ahead| begin + ahead)
 }
 
 /// Error: a model that does not fit the sensor.

@@ -8,6 +8,7 @@ mod directions;
 pub mod lines;
 pub mod marks;
 pub mod motion;
+mod search;
 pub mod segments;
 pub mod velocity;
 pub mod zones;

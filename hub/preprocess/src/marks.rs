@@ -5,8 +5,8 @@ use std::f64::consts::{PI, TAU};
 
 use scanhub_schema::{Contents, Family, Intensities, MARKS, Mark, Marks, Scan, in_degrees};
 
-use crate::background::position;
 use crate::directions::exact_angle;
+use crate::search::position;
 
 /// Settings of a mark detector.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,7 +9,7 @@ use std::f64::consts::TAU;
 
 use scanhub_schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
 
-use crate::background::position;
+use crate::search::position;
 
 /// Sector of the sensor's view in which parts of the robot itself are visible.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -549,13 +549,12 @@ struct Nearest {
 impl Nearest {
     /// Creates the search for at most `beams` beams. There are none yet.
     fn none(beams: usize) -> Nearest {
-        let blocks = vec![0.0; beams.div_ceil(BLOCK)].into_boxed_slice();
         Nearest {
             seen: Spans::none(beams),
             twice_q: vec![0.0; beams].into(),
-            least_twice_q: blocks.clone(),
-            shortest: vec![u16::MAX; blocks.len()].into(),
-            bounds: blocks,
+            least_twice_q: vec![0.0; beams.div_ceil(BLOCK)].into(),
+            shortest: vec![u16::MAX; beams.div_ceil(BLOCK)].into(),
+            bounds: vec![0.0; beams.div_ceil(BLOCK)].into(),
         }
     }
 

@@ -86,8 +86,9 @@ impl Desk {
         let (name, root) = (env.place().name().to_owned(), env.path("").display().to_string());
         let script = format!(
             "#!/bin/sh\ncase $1 in run | replay) other=x ;; esac\n\
-             exec '{}' \"$@\" --domain \"{name}$other\" --root '{root}'\n",
-            env!("CARGO_BIN_EXE_scanhub"),
+             if [ \"$1 $2\" = 'web --replay' ]; then exec '{program}' \"$@\"; fi\n\
+             exec '{program}' \"$@\" --domain \"{name}$other\" --root '{root}'\n",
+            program = env!("CARGO_BIN_EXE_scanhub"),
         );
         write_program(env.path("bin/scanhub"), script);
         env.file("capture.bin", stream.out);

@@ -4,7 +4,8 @@
 //! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`]
 //! were found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
-use super::{Class, INVALID, Limits, Runs, position};
+use super::{Class, INVALID, Limits, Runs};
+use crate::search::position;
 use scanhub_schema::Background;
 
 /// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of
@@ -93,6 +94,7 @@ pub(super) struct Multi {
 /// In a room where nothing moves, all beams of most blocks meet the same surface scan after scan, which is fully known.
 /// Such a scan changes only its range, so the block takes a short path with the same result.
 #[derive(Clone)]
+#[cfg_attr(test, derive(Debug, PartialEq))]
 struct Block {
     slots: [Slots; SLOTS],
     /// Weight that the next surface of the beam gains: more if previous scans had no return.
@@ -103,6 +105,7 @@ struct Block {
 
 /// A surface of each beam of a block, if it has one.
 #[derive(Clone)]
+#[cfg_attr(test, derive(Debug, PartialEq))]
 struct Slots {
     /// In device units.
     range: [u16; BLOCK],
@@ -124,11 +127,10 @@ struct Bounds {
 impl Multi {
     /// Creates the state for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Multi {
-        let blocks = beams.div_ceil(BLOCK);
         Multi {
-            blocks: vec![Block::NEW; blocks].into(),
+            blocks: vec![Block::NEW; beams.div_ceil(BLOCK)].into(),
             runs: Runs::new(beams),
-            nearest: vec![INVALID; blocks * BLOCK].into(),
+            nearest: vec![INVALID; beams.next_multiple_of(BLOCK)].into(),
         }
     }
 
@@ -503,9 +505,7 @@ mod tests {
             let state = |multi: &Multi| {
                 let mut multi = multi.clone();
                 multi.blocks.iter_mut().for_each(|block| block.unsettle());
-                let all = multi.blocks.iter().flat_map(|block| block.slots.clone());
-                let gains = multi.blocks.iter().flat_map(|block| block.gain);
-                (all.map(|slots| (slots.range, slots.weight)).collect::<Vec<_>>(), gains.collect::<Vec<_>>())
+                multi.blocks
             };
             assert_eq!(state(&short), state(&long), "scan {number}");
         }

@@ -1,0 +1,15 @@
+//! Search for rare values in arrays with one value for each beam.
+
+/// Returns the index of the first value from `from` on that `is_it`. Such values are rare, so whole blocks are
+/// compared, without a branch for each value.
+pub(crate) fn position<T: Copy>(values: &[T], from: usize, is_it: impl Fn(T) -> bool) -> Option<usize> {
+    const BLOCK: usize = 32;
+    let mut begin = from;
+    while let Some(block) = values[begin..].first_chunk::<BLOCK>() {
+        if block.iter().fold(false, |any, &value| any | is_it(value)) {
+            break;
+        }
+        begin += BLOCK;
+    }
+    values[begin..].iter().position(|&value| is_it(value)).map(|ahead| begin + ahead)
+}
