@@ -7,6 +7,7 @@ use std::ffi::{OsStr, OsString};
 use std::mem::MaybeUninit;
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -31,6 +32,10 @@ const PAUSE: Duration = Duration::from_secs(2);
 
 /// Interval of the looks for a hub if the directories cannot be watched.
 const UNWATCHED_INTERVAL: Duration = Duration::from_secs(2);
+
+/// Interval of the looks for a hub if all directories are watched. The kernel does not report the removal of a directory
+/// while any process has a file of it open.
+const RECHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Files of a domain's directory that a hub or listener writes when it starts.
 const FILES: [&str; 3] = ["hub.lock", "listen.lock", "prefix"];
@@ -78,15 +83,14 @@ impl HubMonitor {
         directories.watch(places) || is_new || change == Change::Related
     }
 
-    /// Returns the time after which the caller must look for a hub although nothing has changed. `None` if changes make
-    /// the descriptor readable.
-    pub(crate) fn interval(&self) -> Option<Duration> {
+    /// Returns the time after which the caller must look for a hub although nothing has changed.
+    pub(crate) fn interval(&self) -> Duration {
         match &self.directories {
             Some(Directories { paused_until: Some(until), .. }) => {
-                Some(until.saturating_duration_since(Instant::now()))
+                until.saturating_duration_since(Instant::now())
             }
-            Some(directories) if directories.is_complete => None,
-            _ => Some(UNWATCHED_INTERVAL),
+            Some(directories) if directories.is_complete => RECHECK_INTERVAL,
+            _ => UNWATCHED_INTERVAL,
         }
     }
 }
@@ -111,6 +115,9 @@ struct Watch {
 struct Target {
     directory: PathBuf,
     entry: Option<OsString>,
+    /// Device and inode of the directory: one that was removed and created again is another one. `None` if it was
+    /// removed before it could be watched.
+    inode: Option<(u64, u64)>,
 }
 
 /// Changes in the directories.
@@ -138,11 +145,16 @@ impl Directories {
         }
         let old = std::mem::take(&mut self.watches);
         self.is_complete = true;
-        for target in targets {
+        for mut target in targets {
             let number = match inotify::add_watch(&self.inotify, &target.directory, target.flags()) {
                 Ok(number) => Some(number),
-                // It was removed, or belongs to another user, who then has its hub.
-                Err(Errno::NOENT | Errno::NOTDIR | Errno::ACCESS) => None,
+                // It was removed. The next one can have the same inode.
+                Err(Errno::NOENT | Errno::NOTDIR) => {
+                    target.inode = None;
+                    None
+                }
+                // It belongs to another user, who then has its hub.
+                Err(Errno::ACCESS) => None,
                 Err(_) => {
                     self.is_complete = false;
                     None
@@ -214,17 +226,15 @@ const LOST: inotify::ReadFlags = inotify::ReadFlags::IGNORED
 impl Target {
     /// Returns the directory `root` of a domain, or the nearest one above it that exists.
     fn of(root: &Path) -> Target {
-        if root.is_dir() {
-            return Target { directory: root.to_owned(), entry: None };
-        }
-        let mut path = root;
-        while let (Some(above), Some(name)) = (path.parent(), path.file_name()) {
-            if above.is_dir() {
-                return Target { directory: above.to_owned(), entry: Some(name.to_owned()) };
+        let mut entry = None;
+        for directory in root.ancestors() {
+            if let Some(metadata) = directory.metadata().ok().filter(|metadata| metadata.is_dir()) {
+                let inode = Some((metadata.dev(), metadata.ino()));
+                return Target { directory: directory.to_owned(), entry: entry.map(OsStr::to_owned), inode };
             }
-            path = above;
+            entry = directory.file_name();
         }
-        Target { directory: PathBuf::from("/"), entry: None }
+        Target { directory: PathBuf::from("/"), entry: None, inode: None }
     }
 
     fn flags(&self) -> inotify::WatchFlags {
@@ -294,7 +304,27 @@ mod tests {
         while monitor.watch_directories(&places) {}
         fs::create_dir_all(base.path().join("a/b/lab")).unwrap();
         assert!(becomes_readable(&monitor, LONG), "it watches where the directory was");
-        assert_eq!(monitor.interval(), None);
+        assert_eq!(monitor.interval(), RECHECK_INTERVAL);
+    }
+
+    #[test]
+    fn a_directory_that_was_replaced_while_a_file_of_it_is_open_is_watched_again() {
+        let base = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
+        let domain = base.path().join("lab");
+        let places = [Domain::at("lab", base.path()).unwrap()];
+        fs::create_dir(&domain).unwrap();
+        let _open = fs::File::create(domain.join("other")).unwrap();
+        let mut monitor = monitor();
+        while monitor.watch_directories(&places) {}
+        fs::remove_dir_all(&domain).unwrap();
+        fs::create_dir(&domain).unwrap();
+        // No change is reported, so the caller looks after the interval.
+        assert!(!becomes_readable(&monitor, NOW));
+        assert!(monitor.interval() <= RECHECK_INTERVAL);
+        assert!(monitor.watch_directories(&places), "it is another directory");
+        while monitor.watch_directories(&places) {}
+        fs::write(domain.join("hub.lock"), "1").unwrap();
+        assert!(becomes_readable(&monitor, LONG) && monitor.watch_directories(&places));
     }
 
     #[test]
@@ -308,8 +338,8 @@ mod tests {
         assert!(!monitor.watch_directories(&places), "it is not the domain");
         fs::write(base.path().join("another"), "").unwrap();
         assert!(!becomes_readable(&monitor, NOW), "it pauses");
-        let interval = monitor.interval().expect("it must look after the pause");
-        assert!(interval <= PAUSE);
+        let interval = monitor.interval();
+        assert!(interval <= PAUSE, "it must look after the pause");
         fs::create_dir(base.path().join("lab")).unwrap();
         std::thread::sleep(interval);
         assert!(monitor.watch_directories(&places), "nothing is lost by the pause");

@@ -240,7 +240,7 @@ impl Session {
             Some(_) if self.quick_until.is_some_and(|until| Instant::now() < until) => Some(LONGEST_WAIT),
             Some(_) => Some(MAKE_SURE_EVERY),
             None if self.presence.short().is_some() => Some(LONGEST_WAIT),
-            None => readiness.monitor.interval(),
+            None => Some(readiness.monitor.interval()),
         };
         readiness.again_in(pace.into_iter().chain(left).min())?;
         Ok(self.joined.as_mut().map_or(Ok(false), |joined| joined.wakeups.take())?)
