@@ -27,6 +27,9 @@ fn scans(place: &Place) -> PollableSubscriber<Scan> {
 /// Far longer than anything takes on a busy machine.
 const LONG: Duration = Duration::from_secs(60);
 
+/// Period with which a verdict is valid for more than a second, in us, so that a busy machine reads it before its end.
+const LONG_PERIOD_US: u32 = 500_000;
+
 /// Polls until there is a scan.
 fn polled(scans: &PollableSubscriber<Scan>) -> (u64, bool, usize) {
     let give_up_at = Instant::now() + LONG;
@@ -111,6 +114,7 @@ fn a_verdict_that_gets_too_old_makes_it_readable() {
         hub.front().zones.service.dynamic_config().number_of_subscribers() == 1
     });
     assert!(zones.hub_is_running());
+    hub.front().period_us = LONG_PERIOD_US;
     hub.front().zones(Verdict::Clear, 900);
     until("the verdict", || polled() == (Verdict::Clear, false));
     assert_eq!(polled(), (Verdict::Unknown, true));
@@ -125,6 +129,7 @@ fn a_pollable_robot_is_readable_when_its_verdict_changes() {
         let _ = robot.try_next().unwrap();
         hub.front().zones.subscribers() == 1
     });
+    hub.front().period_us = LONG_PERIOD_US;
     hub.front().zones(Verdict::Clear, 900);
     let verdict = || loop {
         assert!(is_readable(&robot, LONG));
@@ -188,8 +193,8 @@ fn without_a_hub_poll_times_out() {
     let scans = scans(&place);
     assert!(is_readable(&scans, LONG), "it must look for a hub first");
     assert!(scans.try_next().unwrap().is_none());
-    let (wake_ups, timeouts) = wake_ups_and_timeouts(&scans);
-    assert!(wake_ups <= 5 && timeouts > 0, "{wake_ups} wake-ups, {timeouts} timeouts");
+    // The monitor looks every 2 s if it cannot watch the directories. Nothing is taken here, so one look would last.
+    assert!(!is_readable(&scans, Duration::from_secs(5)), "no timer wakes it");
 }
 
 #[test]
@@ -220,8 +225,9 @@ fn a_hub_that_starts_makes_it_readable() {
     let scans = scans(&place);
     assert!(scans.try_next().unwrap().is_none() && !is_readable(&scans, Duration::ZERO));
     let _hub = FakeHub::new(&place.domain, &["front"], 1);
+    assert!(is_readable(&scans, Duration::ZERO), "without a timer");
     until("the hub", || {
-        assert!(is_readable(&scans, LONG), "without a timer");
+        assert!(is_readable(&scans, LONG));
         scans.try_next().unwrap().is_none() && scans.hub_is_running()
     });
 }
