@@ -34,6 +34,8 @@ pub struct Session {
     /// Whether a hub has started, and its shared memory may have other names than those that were joined.
     is_unsure: bool,
     number: u32,
+    /// Number of hubs or listeners that have started.
+    starts: u32,
     wait: Wait,
     /// CLOCK_BOOTTIME at the last sample, or at the creation, in ns.
     heard_ns: u64,
@@ -58,6 +60,7 @@ impl Session {
             joined: None,
             is_unsure: false,
             number: 0,
+            starts: 0,
             wait: Wait::default(),
             heard_ns: clock::boottime_ns(),
             readiness: None,
@@ -92,6 +95,7 @@ impl Session {
         };
         if change.back.is_some() {
             self.is_unsure = true;
+            self.starts += 1;
             self.quick_until = Some(Instant::now() + 2 * MAKE_SURE_EVERY);
         }
         let is_here = self.joined.as_ref().is_some_and(|joined| joined.domain == *domain);
@@ -166,6 +170,16 @@ impl Session {
     /// Counts the domains joined: ports of an earlier one must be opened again.
     pub fn number(&self) -> u32 {
         self.number
+    }
+
+    /// Counts the starts of a hub or listener that the looks have shown. A session can stay in the domain meanwhile.
+    pub(crate) fn starts(&self) -> u32 {
+        self.starts
+    }
+
+    /// Returns the node of the domain that the session has joined last.
+    pub(crate) fn node(&self) -> Option<&Node<ThreadSafeService>> {
+        self.joined.as_ref().map(|joined| &joined.node)
     }
 
     /// Returns a subscriber of `sensor`, or `None` if its hub or topic does not exist yet. The bell or event is opened

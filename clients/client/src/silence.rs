@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use scanhub_schema::{Maker, Printable, State, Status, Topic};
-use scanhub_shm::Payload;
+use scanhub_schema::{Failure, Kind, Maker, Printable, State, Status, Topic};
+use scanhub_shm::{Domain, Node, Payload, PortFactory, ThreadSafeService};
 
 use crate::error::Error;
 use crate::follower::Follower;
@@ -152,7 +152,15 @@ impl fmt::Display for Silence {
 /// [`Source::why_silent`](crate::streams::Source::why_silent) on, it subscribes to the sensor's status.
 #[derive(Default)]
 pub struct SilenceCheck {
-    status: Option<Box<(Follower<Status>, Option<Status>)>>,
+    status: Option<Box<SensorStatus>>,
+}
+
+/// Status of the sensor.
+struct SensorStatus {
+    follower: Follower<Status>,
+    last: Option<Status>,
+    /// The session's count of starts with the hub that publishes it.
+    starts: u32,
 }
 
 impl SilenceCheck {
@@ -174,11 +182,20 @@ impl SilenceCheck {
             return session.absence();
         };
         let (sensor, topic) = (follower.sensor(), <P as Payload>::TOPIC);
-        if !follower.is_attached(session) {
-            if session.hub_is_starting() {
+        // In this order: a hub has all its topics when it is not starting any more.
+        let is_starting = session.hub_is_starting();
+        // The port of a program that stays in the domain is still open if the next hub lacks the topic.
+        let is_served = match session.node().map(|node| has_publisher(node, sensor, topic)) {
+            Some(Ok(is_served)) => is_served,
+            Some(Err(failure)) => return exhausted(&failure.into()),
+            None => false,
+        };
+        if !follower.is_attached(session) || !is_served {
+            self.status = None;
+            if is_starting || is_served {
                 return Silence::Waiting;
             }
-            return match scanhub_shm::published(domain) {
+            return match published(session, domain, sensor) {
                 Ok(published) => Silence::of_topics(sensor, topic, &published).unwrap_or(Silence::Waiting),
                 Err(failure) => exhausted(&failure.into()),
             };
@@ -186,13 +203,16 @@ impl SilenceCheck {
         if topic.maker() != Maker::Link {
             return Silence::Waiting;
         }
-        let (status, last) =
-            &mut **self.status.get_or_insert_with(|| Box::new((Follower::new(sensor), None)));
+        let starts = session.starts();
+        self.status.take_if(|status| status.starts != starts);
+        let status = self.status.get_or_insert_with(|| {
+            Box::new(SensorStatus { follower: Follower::new(sensor), last: None, starts })
+        });
         // Without its status, nothing is known of the sensor.
-        while let Ok(Some(status)) = status.receive_quietly(session) {
-            *last = Some(*status);
+        while let Ok(Some(received)) = status.follower.receive_quietly(session) {
+            status.last = Some(*received);
         }
-        last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
+        status.last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
     }
 
     /// Ends the subscription to the status. Call it when a sample has arrived.
@@ -200,6 +220,40 @@ impl SilenceCheck {
         self.status = None;
     }
 }
+
+/// Returns the topics in `domain`, without those of `sensor` that only subscribers keep open. Fails if the directory
+/// belongs to another user, or with [`Kind::Short`] if memory or descriptors are short.
+fn published(session: &Session, domain: &Domain, sensor: &str) -> Result<Vec<(String, Topic)>, Failure> {
+    let mut published = Vec::new();
+    for (name, topic) in scanhub_shm::published(domain)? {
+        let is_served = match session.node().filter(|_| name == sensor) {
+            Some(node) => has_publisher(node, &name, topic)?,
+            None => true,
+        };
+        published.extend(is_served.then_some((name, topic)));
+    }
+    Ok(published)
+}
+
+macro_rules! has_publisher {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        /// Returns whether any program publishes the `topic` of `sensor`. A topic of another layout counts. Fails with
+        /// [`Kind::Short`] if memory or descriptors are short.
+        fn has_publisher(node: &Node<ThreadSafeService>, sensor: &str, topic: Topic) -> Result<bool, Failure> {
+            let publishers = match topic {
+                $(Topic::$topic => <scanhub_schema::payload_type!($payload)>::open(node, sensor)
+                    .map(|service| service.map(|service| service.dynamic_config().number_of_publishers())),)*
+            };
+            match publishers {
+                Ok(publishers) => Ok(publishers.is_some_and(|publishers| publishers > 0)),
+                Err(failure) if failure.kind == Kind::Short => Err(failure),
+                Err(_) => Ok(true),
+            }
+        }
+    };
+}
+
+scanhub_schema::for_each_topic!(has_publisher);
 
 #[cfg(test)]
 mod tests {

@@ -91,12 +91,65 @@ fn a_topic_that_the_hub_does_not_publish_is_unknown() {
     let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
     let node = scanhub_shm::hub_node(&place.domain).unwrap();
     let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
-    let _scan = Scan::create(&node, "front", &TopicLimits::default()).unwrap();
+    let limits = TopicLimits::default();
+    let scan = Scan::create(&node, "front", &limits).unwrap();
+    let _publisher = Scan::publisher(&scan, &limits).unwrap();
     lock.report_ready().unwrap();
     let mut marks = Subscriber::<Marks>::builder("front").in_domain(&place.domain).open().unwrap();
     let silence = marks.why_silent();
     let Silence::UnknownTopic { topic, topics, .. } = &silence else { panic!("{silence}") };
     assert_eq!((&topic[..], &topics[..]), ("front/marks", &[Topic::Scan.name().to_owned()][..]));
+}
+
+#[test]
+fn a_restarted_hub_without_the_sensor_is_the_reason() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut scans = scans(&place, "front");
+    // Ports of the same program keep topics of the sensor open.
+    let builder = Subscriber::<Marks>::builder("front").in_domain(&place.domain);
+    let mut marks = builder.open().unwrap();
+    until("the state", || {
+        hub.front().status(|status| status.state = State::Paused as u8);
+        assert!(marks.try_next().unwrap().is_none() && scans.try_next().unwrap().is_none());
+        matches!(scans.why_silent(), Silence::Paused { .. })
+    });
+    assert_eq!((hub.front().scan.subscribers(), hub.front().marks.subscribers()), (1, 1));
+    drop(hub);
+    until("the end", || matches!(scans.why_silent(), Silence::NoHub { .. }));
+    let hub = FakeHub::new(&place.domain, &["rear"], 2);
+    let is_unknown = |silence: &Silence| matches!(silence, Silence::UnknownSensor { .. });
+    let silence = reason(&mut scans, is_unknown);
+    assert!(is_unknown(&silence), "{silence}");
+    assert_eq!(silence.remedy(), "the sensors are rear");
+    drop(hub);
+    let _hub = FakeHub::new(&place.domain, &["front"], 3);
+    assert_eq!(reason(&mut scans, |silence| *silence == Silence::Waiting), Silence::Waiting);
+}
+
+#[test]
+fn the_state_of_the_last_hub_is_not_the_reason() {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    let mut scans = scans(&place, "front");
+    until("the state", || {
+        hub.front().status(|status| status.state = State::Paused as u8);
+        assert!(scans.try_next().unwrap().is_none());
+        matches!(scans.why_silent(), Silence::Paused { .. })
+    });
+    // The program never calls `why_silent` while no hub runs.
+    drop(hub);
+    until("the end", || {
+        assert!(scans.try_next().unwrap().is_none());
+        !scans.hub_is_running()
+    });
+    let _hub = FakeHub::new(&place.domain, &["front"], 2);
+    until("the next hub", || {
+        assert!(scans.try_next().unwrap().is_none());
+        scans.hub_is_running()
+    });
+    // It sends no status.
+    assert_eq!(scans.why_silent(), Silence::Waiting);
 }
 
 #[test]
@@ -107,6 +160,7 @@ fn a_topic_without_a_place_is_full() {
     let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
     let limits = TopicLimits { consumers: 1, ..TopicLimits::default() };
     let scan = Scan::create(&node, "front", &limits).unwrap();
+    let _publisher = Scan::publisher(&scan, &limits).unwrap();
     lock.report_ready().unwrap();
     let mut first = scans(&place, "front");
     assert!(first.try_next().unwrap().is_none());
