@@ -518,9 +518,10 @@ impl Follow for Verdicts {
     fn descriptor(&mut self) -> Result<i32, Error> {
         if self.wait.is_none() {
             // Nothing was received, so another subscriber misses nothing.
-            if self.robot.take().is_some() {
+            if self.robot.is_some() {
                 let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
                 self.pollable = Some(builder(&sensors, &self.place, self.early).open_pollable()?);
+                self.robot = None;
             }
             self.wait = Some(Wait::Event);
         }

@@ -113,8 +113,9 @@ macro_rules! follower {
 
             /// Whether a hub or listener publishes in the domain, as of the last look.
             #[getter]
-            fn hub_lives(&self) -> bool {
-                self.source.with(|source| source.hub_lives()).unwrap_or_default()
+            fn hub_lives(&self, py: Python<'_>) -> bool {
+                // A thread that waits has the lock for a tenth of a second.
+                py.detach(|| self.source.with(|source| source.hub_lives())).unwrap_or_default()
             }
 
             /// Seconds since the last sample; if there was none, since the start. Time in suspend counts.
@@ -135,8 +136,9 @@ macro_rules! follower {
             }
 
             #[getter]
-            fn _is_open(&self) -> bool {
-                is_open(&self.source)
+            fn _is_open(&self, py: Python<'_>) -> Result<bool, Error> {
+                let _reserved = self.source.reserve()?;
+                Ok(py.detach(|| is_open(&self.source)))
             }
 
             fn _poll(&self, $py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {

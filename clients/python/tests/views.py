@@ -2,6 +2,7 @@
 stream."""
 
 import asyncio
+import contextlib
 import gc
 import multiprocessing
 import os
@@ -10,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import scanhub
@@ -230,6 +232,37 @@ def asyncio_waits_without_a_thread(_: scanhub.Subscription) -> None:
     asyncio.run(follow())
 
 
+def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
+    async def follow() -> None:
+        for in_thread in (False, True):
+            waits: list[Any] = [
+                scanhub.subscribe("nobody/scan", domain=domain, root=root),
+                scanhub.robot("nobody", domain=domain, root=root),
+            ]
+            for wait in waits:
+                with contextlib.suppress(asyncio.TimeoutError):
+                    while True:  # What is known of a robot at once.
+                        await asyncio.wait_for(wait.__anext__(), 0.3)
+                task = asyncio.ensure_future(wait.__anext__())
+                await asyncio.sleep(0.1)
+                try:
+                    await wait.__anext__()
+                    raise AssertionError("two tasks waited")
+                except scanhub.Failure as said:
+                    assert "another task" in said.message
+                if in_thread:
+                    await asyncio.get_running_loop().run_in_executor(None, wait.close)
+                else:
+                    wait.close()
+                try:
+                    await asyncio.wait_for(task, 60)
+                    raise AssertionError("it was closed")
+                except StopAsyncIteration:
+                    pass
+
+    asyncio.run(follow())
+
+
 def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
     next(scans)
 
@@ -281,6 +314,7 @@ for check in (
     two_threads_at_a_time_are_refused,
     ctrl_c_ends_a_wait,
     asyncio_waits_without_a_thread,
+    a_close_ends_the_wait_of_a_task,
     a_subscription_has_one_kind_of_loop,
     a_child_of_multiprocessing_takes_nothing,
     a_child_is_refused,

@@ -16,7 +16,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from typing import Any, Callable
+import weakref
+from typing import Any, Callable, Tuple, Union
 
 from . import _scanhub
 from ._scanhub import (
@@ -133,6 +134,8 @@ Shown = Background
 async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any:
     """Waits for the next item. A task that is canceled meanwhile loses none: each is received just before the return."""
     loop = asyncio.get_running_loop()
+    if follower in _waiting:
+        raise Failure("another task waits for this object", "make one for each task")
     until = None if follower._timeout is None else loop.time() + follower._timeout
     while follower._is_open:
         descriptor = follower._descriptor()
@@ -144,25 +147,59 @@ async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any
         # Without a hub, the descriptor may never be readable, but the warning is due.
         due = follower._warning_due
         ends = [end for end in (until, None if due is None else loop.time() + due) if end is not None]
-        await _readable(loop, descriptor, min(ends, default=None))
+        await _readable(follower, loop, descriptor, min(ends, default=None))
     raise StopAsyncIteration
 
 
-async def _readable(loop: asyncio.AbstractEventLoop, descriptor: int, until: float | None) -> None:
+_Follower = Union[_scanhub.Subscription, _scanhub.RobotFollower]
+_Waiting = Tuple[asyncio.AbstractEventLoop, int, Callable[[], None]]
+_waiting: weakref.WeakKeyDictionary[_Follower, _Waiting] = weakref.WeakKeyDictionary()
+"""For each object for which a task waits: the loop, the descriptor in it, and the function that ends the wait."""
+
+
+async def _readable(
+    follower: _Follower, loop: asyncio.AbstractEventLoop, descriptor: int, until: float | None
+) -> None:
     ready = loop.create_future()
 
     def wake() -> None:
         if not ready.done():
             ready.set_result(None)
 
+    _waiting[follower] = (loop, descriptor, wake)
     loop.add_reader(descriptor, wake)
     timer = None if until is None else loop.call_at(until, wake)
     try:
         await ready
     finally:
-        loop.remove_reader(descriptor)
+        _end_wait(follower)
         if timer is not None:
             timer.cancel()
+
+
+def _end_wait(follower: _Follower) -> None:
+    """Lets the task that waits for `follower` go on. Runs in the thread of its loop."""
+    waiting = _waiting.pop(follower, None)
+    if waiting is not None:
+        loop, descriptor, wake = waiting
+        loop.remove_reader(descriptor)
+        wake()
+
+
+def _close(follower: _Follower, close: Callable[[], None]) -> None:
+    """Calls `close` after the loop has forgotten the descriptor of `follower`: in the thread of the loop, so later if another
+    thread closes it."""
+    waiting = _waiting.get(follower)
+    if waiting is not None:
+        try:
+            is_in_loop = asyncio.get_running_loop() is waiting[0]
+        except RuntimeError:
+            is_in_loop = False
+        if not is_in_loop and not waiting[0].is_closed():
+            waiting[0].call_soon_threadsafe(_close, follower, close)
+            return
+        _end_wait(follower)
+    close()
 
 
 class Subscription(_scanhub.Subscription):
@@ -174,6 +211,10 @@ class Subscription(_scanhub.Subscription):
 
     async def __anext__(self) -> Any:
         return await _next(self)
+
+    def close(self) -> None:
+        """Leaves the domain. Samples that the program keeps stay readable."""
+        _close(self, super().close)
 
     def __enter__(self) -> Subscription:
         return self
@@ -192,6 +233,10 @@ class RobotFollower(_scanhub.RobotFollower):
     async def __anext__(self) -> Robot:
         verdict: Robot = await _next(self)
         return verdict
+
+    def close(self) -> None:
+        """Leaves the domain."""
+        _close(self, super().close)
 
     def __enter__(self) -> RobotFollower:
         return self
