@@ -115,8 +115,8 @@ struct Watch {
 struct Target {
     directory: PathBuf,
     entry: Option<OsString>,
-    /// Device and inode of the directory: one that was removed and created again is another one. `None` if it was
-    /// removed before it could be watched.
+    /// Device and inode of the directory, which change if a program removes it and creates it again. `None` if it was
+    /// removed before the monitor could watch it.
     inode: Option<(u64, u64)>,
 }
 
