@@ -3,6 +3,7 @@
 //!
 //! Each topic is in order, so one sample of each is enough: if their numbers differ, the earlier one has no partner.
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use scanhub_schema::Header;
@@ -49,7 +50,7 @@ pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
     /// The sample of the second topic.
     pub second: Received<B>,
     /// Pairs between the last one and this one that were not received whole: one or both samples were missed, or one
-    /// was never sent. 0 for the first pair.
+    /// was never sent. It is the smallest number that the numbers of both topics allow. 0 for the first pair.
     pub missed: u64,
     /// Whether the hub was restarted since the last pair.
     pub restarted: bool,
@@ -60,6 +61,7 @@ pub struct JoinedSubscriber<A: Payload + ?Sized, B: Payload + ?Sized> {
     session: Session,
     first: Side<A>,
     second: Side<B>,
+    discarded: Discarded,
     timeout: Option<Duration>,
     /// Whether a pair was returned before.
     has_begun: bool,
@@ -76,6 +78,17 @@ struct Side<P: Payload + ?Sized> {
     restarted: bool,
 }
 
+/// Telegrams since the last pair with a sample that was dropped because it had no partner.
+#[derive(Default)]
+struct Discarded {
+    count: u64,
+    /// `boot` and `seq` of the last ones. The partner of a dropped sample can arrive too late, and is dropped, too.
+    recent: VecDeque<(u64, u64)>,
+}
+
+/// Number of telegrams after which no sample arrives too late: no topic has a longer queue.
+const RECENT: usize = 64;
+
 /// Wait for the partner of a sample without a period, in ns.
 const NO_PERIOD_NS: u64 = 500_000_000;
 
@@ -91,6 +104,7 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
             session,
             first,
             second,
+            discarded: Discarded::default(),
             timeout,
             has_begun: false,
             silence: SilenceCheck::default(),
@@ -196,14 +210,16 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
                 (None, Some(_)) if self.second.is_overdue() => false,
                 _ => return Ok(None),
             };
-            if is_first_earlier { self.first.discard() } else { self.second.discard() }
+            let dropped = if is_first_earlier { self.first.discard() } else { self.second.discard() };
+            dropped.into_iter().for_each(|telegram| self.discarded.add(telegram));
         }
     }
 
     fn pair(&mut self) -> Option<Joined<A, B>> {
         let (first, second) = (self.first.waiting.take()?.0, self.second.waiting.take()?.0);
-        // Each topic has lost every pair that was not whole.
+        // A telegram without a sample of one topic may have a sample of the other one, which was dropped.
         let lost = std::mem::take(&mut self.first.lost).max(std::mem::take(&mut self.second.lost));
+        let lost = lost.max(std::mem::take(&mut self.discarded).count);
         let missed = if std::mem::replace(&mut self.has_begun, true) { lost } else { 0 };
         let restarted =
             std::mem::take(&mut self.first.restarted) | std::mem::take(&mut self.second.restarted);
@@ -250,8 +266,24 @@ impl<P: Payload + ?Sized> Side<P> {
         self.overdue_ns().is_some_and(|overdue_ns| overdue_ns <= clock::now_ns())
     }
 
-    /// Drops the sample that waits.
-    fn discard(&mut self) {
-        self.lost += u64::from(self.waiting.take().is_some());
+    /// Drops the sample that waits. Returns `boot` and `seq` of its telegram.
+    fn discard(&mut self) -> Option<(u64, u64)> {
+        let (sample, _) = self.waiting.take()?;
+        self.lost += 1;
+        Some((sample.header().boot, sample.header().seq))
+    }
+}
+
+impl Discarded {
+    /// Counts `telegram` unless it was counted before.
+    fn add(&mut self, telegram: (u64, u64)) {
+        if self.recent.contains(&telegram) {
+            return;
+        }
+        if self.recent.len() == RECENT {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(telegram);
+        self.count += 1;
     }
 }
