@@ -87,7 +87,7 @@ struct Discarded {
 }
 
 /// Number of telegrams after which no sample arrives too late: no topic has a longer queue.
-const RECENT: usize = 64;
+const RECENT: usize = 128;
 
 /// Wait for the partner of a sample without a period, in ns.
 const NO_PERIOD_NS: u64 = 500_000_000;
