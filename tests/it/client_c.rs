@@ -334,7 +334,11 @@ fn what_a_program_does_wrong_is_refused() {
     if is_there("valgrind") {
         // What a child keeps of its parent is found, in part by addresses of its middle.
         let leaks = ["--leak-check=full", "--show-leak-kinds=definite", "--errors-for-leak-kinds=definite"];
-        let words = ["valgrind", "--quiet", leaks[0], leaks[1], leaks[2], "--error-exitcode=9"];
+        let known =
+            concat!("--suppressions=", env!("CARGO_MANIFEST_DIR"), "/tests/it/client_c/valgrind.supp");
+        let frames = "--num-callers=40";
+        let words =
+            ["valgrind", "--quiet", leaks[0], leaks[1], leaks[2], known, frames, "--error-exitcode=9"];
         ways.push(words.into_iter().map(str::to_owned).chain([plain]).collect());
     }
     for way in ways {
