@@ -93,7 +93,7 @@ const RECENT: usize = 128;
 const NO_PERIOD_NS: u64 = 500_000_000;
 
 impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
-    /// Returns the options of a subscriber of two topics of `sensor`.
+    /// Returns a builder of a subscriber that follows two topics of `sensor`.
     pub fn builder(sensor: &str) -> SubscriberBuilder<JoinedSubscriber<A, B>> {
         SubscriberBuilder::new(&[sensor])
     }

@@ -161,7 +161,7 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) with what is free and what is needed.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there is too little. The message has both amounts.
     pub fn check_room(&self, topics: &[Topic]) -> Result<(), Error> {
         check_topics(topics, &self.0.limits)?;
         Ok(check_descriptors((topics.len() as u64 + 1) * SERVICE_DESCRIPTORS)?)

@@ -94,7 +94,7 @@ pub struct RobotSubscriber {
 }
 
 impl RobotSubscriber {
-    /// Returns the options of a subscriber of the zones of `sensors`. If empty: all sensors, as [`robot`] does.
+    /// Returns a builder of a subscriber that follows the zones of `sensors`, or without names those of all sensors.
     pub fn builder(sensors: &[&str]) -> SubscriberBuilder<RobotSubscriber> {
         SubscriberBuilder::new(sensors)
     }
@@ -109,7 +109,7 @@ impl RobotSubscriber {
     ///
     /// # Errors
     ///
-    /// As [`Subscriber::next`](crate::Subscriber::next): nothing is known then either.
+    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The verdict is unknown then, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<&Robot, Error> {
         while !self.hear()? {

@@ -105,8 +105,8 @@ macro_rules! samples {
 scanhub_schema::for_each_topic!(samples);
 
 impl Source {
-    /// As [`new`](Self::new) for the zones of `sensor`, with its early warnings: one makes the verdict worse until the
-    /// zones of its scan are there, or until it is withdrawn.
+    /// Creates the source of the zones and early warnings of `sensor`. A warning makes the verdict worse until the zones
+    /// of its scan arrive or the hub withdraws it.
     pub fn zones_with_early(sensor: &str) -> Source {
         match sensor {
             ROBOT => Source::Robot(RobotSource::new(&[]).with_early()),
@@ -114,7 +114,7 @@ impl Source {
         }
     }
 
-    /// Returns after which time there may be something to receive although nothing was sent.
+    /// Returns the time after which the source may report a silence. `None` if it never does.
     pub fn left(&self) -> Option<Duration> {
         match self {
             Source::Zones(source) => source.left(),
@@ -125,7 +125,7 @@ impl Source {
 }
 
 impl Sample {
-    /// Returns numbers, stamps and quality; nothing if nobody sent it: then it stands for a silence.
+    /// Returns numbers, stamps and quality. `None` if the sample stands for a silence.
     pub fn header(&self) -> Option<&Header> {
         self.any().header()
     }
@@ -140,13 +140,12 @@ impl Sample {
         self.header().map_or(0, |header| header.period_us)
     }
 
-    /// Returns whether it was said before `since_ns` of CLOCK_MONOTONIC: a topic keeps it for late joiners, or it
-    /// waited for them.
+    /// Returns whether the sample was sent before `since_ns` of CLOCK_MONOTONIC, so that it waited for this subscriber.
     pub fn is_of_before(&self, since_ns: u64) -> bool {
         self.header().is_some_and(|header| header.stamp_last_ns < since_ns)
     }
 
-    /// Returns whether nobody sent it: it stands for a silence.
+    /// Returns whether the sample stands for a silence, and was not sent.
     pub fn is_silence(&self) -> bool {
         self.header().is_none()
     }
@@ -156,8 +155,8 @@ impl Sample {
         self.any().bytes()
     }
 
-    /// Writes the payload as it goes over a network to the beginning of `room`, and returns its length; nothing if
-    /// there is too little room.
+    /// Writes the payload in the format of datagrams to the beginning of `room`, and returns its length in bytes. `None`
+    /// if `room` is too short.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         self.any().pack(room)
     }

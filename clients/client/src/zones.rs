@@ -68,7 +68,7 @@ pub struct ZonesSubscriber {
 }
 
 impl ZonesSubscriber {
-    /// Returns the options of a subscriber of the zones of `sensor`.
+    /// Returns a builder of a subscriber that follows the zones of `sensor`.
     pub fn builder(sensor: &str) -> SubscriberBuilder<ZonesSubscriber> {
         SubscriberBuilder::new(&[sensor])
     }
@@ -83,7 +83,7 @@ impl ZonesSubscriber {
     ///
     /// # Errors
     ///
-    /// As [`Subscriber::next`](crate::Subscriber::next): nothing is known then either.
+    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The zones are unknown then, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Error> {
         loop {

@@ -241,7 +241,7 @@ def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
             ]
             for wait in waits:
                 with contextlib.suppress(asyncio.TimeoutError):
-                    while True:  # What is known of a robot at once.
+                    while True:  # A robot has a first verdict at once.
                         await asyncio.wait_for(wait.__anext__(), 0.3)
                 task = asyncio.ensure_future(wait.__anext__())
                 await asyncio.sleep(0.1)

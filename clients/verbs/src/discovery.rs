@@ -91,9 +91,11 @@ impl Discovery {
 
     /// Starts to list the sensors of the hub in `domain` if a list is due. Returns the last list, once, when it is complete.
     /// While the services of the domain stay as they were at the last list, there is no new one. A list executes a million
-    /// instructions for each service, half of what a gateway executes.
+    /// instructions for each service. It was half of the work of a gateway.
     ///
-    /// [`Kind::Failed`](scanhub_schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`](scanhub_schema::Kind) if no list succeeded yet. A later failure keeps the known sensors.
     pub fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((task, age)) = &self.call {
             let Some(answer) = task.result() else { return Ok(None) };

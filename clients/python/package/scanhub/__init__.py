@@ -178,7 +178,7 @@ async def _readable(
 
 
 def _end_wait(follower: _Follower) -> None:
-    """Lets the task that waits for `follower` go on. Runs in the thread of its loop."""
+    """Ends the wait of the task for `follower`. Runs in the thread of its loop."""
     waiting = _waiting.pop(follower, None)
     if waiting is not None:
         loop, descriptor, wake = waiting
