@@ -105,8 +105,8 @@ macro_rules! samples {
 scanhub_schema::for_each_topic!(samples);
 
 impl Source {
-    /// Creates the source of the zones and early warnings of `sensor`. A warning makes the verdict worse until the zones
-    /// of its scan arrive or the hub withdraws it.
+    /// Creates the source of the zones and early warnings of `sensor`. A warning makes the verdict worse until the
+    /// zones of its scan arrive or the hub withdraws it.
     pub fn zones_with_early(sensor: &str) -> Source {
         match sensor {
             ROBOT => Source::Robot(RobotSource::new(&[]).with_early()),
@@ -155,8 +155,8 @@ impl Sample {
         self.any().bytes()
     }
 
-    /// Writes the payload in the format of datagrams to the beginning of `room`, and returns its length in bytes. `None`
-    /// if `room` is too short.
+    /// Writes the payload in the format of datagrams to the beginning of `room`, and returns its length in bytes.
+    /// `None` if `room` is too short.
     pub fn pack(&self, room: &mut [u8]) -> Option<usize> {
         self.any().pack(room)
     }
