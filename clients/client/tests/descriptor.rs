@@ -11,7 +11,7 @@ use fake::{FakeHub, Place, until};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_client::{PollableSubscriber, RobotSubscriber, Subscriber, ZonesSubscriber};
 use scanhub_schema::{Scan, Status, Verdict};
-use scanhub_shm::{PortFactory, UpdateConnections};
+use scanhub_shm::UpdateConnections;
 
 /// Returns whether `descriptor` becomes readable within `longest`.
 fn is_readable(descriptor: &impl AsFd, longest: Duration) -> bool {
@@ -51,7 +51,7 @@ fn it_is_readable_until_all_is_taken_and_the_same_over_lives_of_the_hub() {
         until("the consumer", || {
             assert!(is_readable(&scans, LONG), "it looks for a hub by itself");
             assert!(scans.try_next().unwrap().is_none());
-            hub.front().scan.service.dynamic_config().number_of_subscribers() == 1
+            hub.front().scan.subscribers() == 1
         });
         for beams in [5, 6] {
             hub.front().scan(&vec![1000; beams]);
@@ -71,7 +71,7 @@ fn a_hub_that_lives_and_says_nothing_wakes_nobody_but_once_a_second() {
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
     until("the consumer", || {
         assert!(scans.try_next().unwrap().is_none());
-        hub.front().scan.service.dynamic_config().number_of_subscribers() == 1
+        hub.front().scan.subscribers() == 1
     });
     let (started, mut looks) = (Instant::now(), 0);
     while started.elapsed() < Duration::from_secs(3) {
@@ -111,7 +111,7 @@ fn a_verdict_that_gets_too_old_makes_it_readable() {
     };
     until("the consumer", || {
         let _ = zones.try_next().unwrap();
-        hub.front().zones.service.dynamic_config().number_of_subscribers() == 1
+        hub.front().zones.subscribers() == 1
     });
     assert!(zones.hub_is_running());
     hub.front().period_us = LONG_PERIOD_US;

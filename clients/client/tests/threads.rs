@@ -12,7 +12,7 @@ use scanhub_client::{
     Telegram, ZonesSubscriber, streams,
 };
 use scanhub_schema::limits::BORROWED;
-use scanhub_shm::{LocalService, Payload, PortFactory, Role, Service, ThreadSafeService};
+use scanhub_shm::{LocalService, Payload, Role, Service, ThreadSafeService};
 
 /// Far longer than anything takes on a busy machine.
 const LONG: Duration = Duration::from_secs(60);
@@ -57,7 +57,7 @@ fn both_kinds_of_service_attach_to_one_hub() {
         }
     }
     drop((local, shared));
-    until("no subscribers", || hub.front().scan.service.dynamic_config().number_of_subscribers() == 0);
+    until("no subscribers", || hub.front().scan.subscribers() == 0);
 }
 
 #[test]

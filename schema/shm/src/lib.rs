@@ -32,7 +32,7 @@ pub use iceoryx2::prelude::ipc::Service as LocalService;
 /// Shared memory between processes, with ports and samples that may move between threads. They differ from those of
 /// [`LocalService`] only in a lock within the process, so both kinds attach to one topic. Clients use it.
 pub use iceoryx2::prelude::ipc_threadsafe::Service as ThreadSafeService;
-pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
+pub use iceoryx2::prelude::{CallbackProgression, PortFactory, ZeroCopySend};
 /// Kind of shared memory: [`LocalService`] or [`ThreadSafeService`].
 pub use iceoryx2::service::Service;
 pub use processes::{

@@ -15,8 +15,10 @@ use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{
     Background, Failure, Foreground, Header, Marks, Scan, ScanHead, State, Status, Verdict, Wake, Zones,
 };
+use scanhub_shm::{
+    CallbackProgression, Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker,
+};
 use scanhub_shm::{Domain, HubLock};
-use scanhub_shm::{Node, Payload, PortFactory, Publisher, TopicService, UpdateConnections, Waker};
 use tempfile::TempDir;
 
 /// A domain that goes with the test.
@@ -66,13 +68,20 @@ impl<P: Payload + ?Sized> Port<P> {
         Port { publisher: P::publisher(&service, &limits).unwrap(), service, topic_seq: 0 }
     }
 
-    /// Waits until `count` consumers are there.
+    /// Waits until the next sample reaches `count` subscribers.
     pub(crate) fn await_subscribers(&self, count: usize) {
         until("subscribers", || self.subscribers() == count);
     }
 
+    /// Returns the number of subscribers that the next sample reaches. The service's own number is no proof: it
+    /// includes a subscriber that is about to enter the list, which a publisher does not see yet.
     pub(crate) fn subscribers(&self) -> usize {
-        self.service.dynamic_config().number_of_subscribers()
+        let mut count = 0;
+        self.service.dynamic_config().list_subscribers(|_| {
+            count += 1;
+            CallbackProgression::Continue
+        });
+        count
     }
 }
 
@@ -306,7 +315,7 @@ impl Sink {
 
 /// Waits until `done`. The limit only bounds a hang.
 pub(crate) fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let give_up_at = Instant::now() + Duration::from_secs(60);
+    let give_up_at = Instant::now() + Duration::from_secs(180);
     while !done() {
         assert!(Instant::now() < give_up_at, "waited in vain for {what}");
         std::thread::sleep(Duration::from_millis(2));

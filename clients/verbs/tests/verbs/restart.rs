@@ -8,7 +8,6 @@ use crate::echo::{Format, start};
 use crate::fake::{FakeHub, Place, until};
 use scanhub_client::Subscriber;
 use scanhub_schema::Scan;
-use scanhub_shm::PortFactory;
 use scanhub_shm::{Domain, holder};
 use scanhub_verbs::Bounds;
 
@@ -113,7 +112,7 @@ fn a_subscription_goes_on_after_a_hub_that_ended_well() {
         let mut hub = FakeHub::new(&place.domain, &["front"], boot);
         until("the consumer", || {
             assert!(scans.try_next().unwrap().is_none());
-            hub.front().scan.service.dynamic_config().number_of_subscribers() == 1
+            hub.front().scan.subscribers() == 1
         });
         hub.front().scan(&[5]);
         let scan = scans.next().unwrap().expect("without a timeout it waits");
