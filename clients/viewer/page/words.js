@@ -159,10 +159,12 @@ function explain() {
 
 const FIELDS = [
   ["rate", "hz", ({ hz }) => (hz === null ? "–" : `${hz.toFixed(1)} Hz`)],
-  ["age p50 / p99", "age", ({ age_p50_ms: half, age_p99_ms: most }) => (half === null ? "–" : `${half.toFixed(1)} / ${most.toFixed(1)} ms`)],
+  ["age p50 / p99", "age", ({ age_p50_ms: half, age_p99_ms: most }) => (half === null ? "–" : `${millis(half)} / ${millis(most)} ms`)],
   ["damaged on the line", "loss", ({ loss }) => percent(loss)],
   ["lost on the line; missed by this program", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
 ];
+// Without a decimal where it would not fit beside another one.
+const millis = (ms) => ms.toFixed(ms < 100 ? 1 : 0);
 const percent = (share) => `${(100 * share).toFixed(!share ? 0 : share < 0.1 ? 2 : 1)} %`;
 const WELL = 0.001;
 
