@@ -4,7 +4,7 @@
 //!   system; `control.rs` receives requests of users, and `reload.rs` applies a new configuration.
 //! - A live link reads top to bottom in `reconnect.rs`, `session_driver.rs`, `link.rs`, `link_output.rs` and
 //!   `pipeline.rs`. `platform.rs` is the border below which a simulation replaces this machine.
-//! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording.
+//! - `replay_hub.rs`, `replay.rs` and `player.rs` play a recording. `reader.rs` computes the same samples without a hub.
 
 mod control;
 mod diagnosis;
@@ -17,6 +17,7 @@ pub mod platform;
 mod player;
 mod process;
 mod publisher;
+mod reader;
 mod reconnect;
 mod reload;
 mod replay;
@@ -31,6 +32,7 @@ mod topics;
 pub use control::{CommandSender, ControlQueue, Outcome};
 pub use player::{PlaybackOptions, PlaybackRate, Player, Progress};
 pub use process::{explain_bus_error, is_hangup_ignored};
+pub use reader::{ReadOptions, ReadSample, RecordingReader};
 pub use reconnect::LiveLink;
 pub use reload::{ConfigLoader, Reload};
 pub use replay::{RecordedAngle, RecordedMount};

@@ -2,11 +2,12 @@
 //! they can be read. The hub sends no requests, because nothing could reply to them.
 //!
 //! `recorded.rs` opens recordings and computes the media time of their telegrams. Recordings with stamps are played by
-//! `frames.rs`. A stream of bytes is played here: it passes through a session like the bytes of a line. The session
-//! also finds out what is damaged in it.
+//! `frames.rs`, and a stream of bytes by `bytes.rs`. A [`Pace`] defines when a telegram is due: [`PlayerPace`] waits for
+//! the player of a hub, and `reader.rs` has one that never waits.
 //!
 //! [`RecordedMount`] plays the angles of a mount. Another program publishes them, because a hub has no topic for them.
 
+mod bytes;
 mod frames;
 mod recorded;
 
@@ -16,21 +17,22 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use scanhub_drivers::line::{Event, Output, Protocol as _};
-use scanhub_drivers::{PortSession, Settings};
+use scanhub_drivers::PortSession;
 use scanhub_port::clock;
 use scanhub_recording::{Frame, MountRecord, Recording};
 use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 
 use crate::control::PauseTarget;
 use crate::link::LinkCore;
-use crate::link_output::RecordedMetadata;
-use crate::platform::WakeReason;
+use crate::platform::{Platform, WakeReason};
 use crate::player::{Due, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
 use crate::system::System;
 
+use bytes::BytesLap;
+pub(crate) use frames::BEGIN;
+use frames::FramesLap;
+use recorded::Timeline;
 pub(crate) use recorded::{Origin, Recorded, log_damage};
-use recorded::{Stream, Timeline, read};
 
 /// Part of a recording that a link plays together with other links.
 pub(crate) struct ReplayPart<'a> {
@@ -47,12 +49,11 @@ pub(crate) fn run<'a>(
     paced: bool,
     report: impl FnOnce(Result<(), Failure>),
 ) {
-    link.output.topics.set_flags(Flags::REPLAYED);
-    link.begin();
+    begin(&mut link);
     if let Some(ReplayPart { recorded, handle }) = part {
         report(Ok(()));
-        let mut replay = ReplayLink::new(link, &recorded, handle);
-        replay.play(recorded);
+        let mut replay = ReplayLink::new(link, &recorded, PlayerPace::new(handle));
+        replay.play(&recorded);
         return replay.link.end();
     }
     let rate = if paced { PlaybackRate::default() } else { PlaybackRate::Max };
@@ -65,10 +66,11 @@ pub(crate) fn run<'a>(
     match alone() {
         Ok((recorded, player)) => {
             report(Ok(()));
-            let mut replay = ReplayLink::new(link, &recorded, PlayerHandle { player: &player, number: 0 });
+            let pace = PlayerPace::new(PlayerHandle { player: &player, number: 0 });
+            let mut replay = ReplayLink::new(link, &recorded, pace);
             if replay.await_subscriber() != WakeReason::Stop {
                 player.begin();
-                replay.play(recorded);
+                replay.play(&recorded);
             }
             replay.link.end();
         }
@@ -79,25 +81,134 @@ pub(crate) fn run<'a>(
     }
 }
 
-/// A link that plays a recording.
-struct ReplayLink<'a, 'p> {
-    link: LinkCore<'a, System<'a>>,
-    handle: PlayerHandle<'p>,
-    /// Message about a problem of the recording; otherwise empty.
-    problem: String,
-    /// Time of the next check for requests while the link plays without a wait.
-    check_at: Nanos,
+/// Publishes the state of `link` before the first telegram of a recording.
+pub(crate) fn begin<S: Platform>(link: &mut LinkCore<'_, S>) {
+    link.output.topics.set_flags(Flags::REPLAYED);
+    link.begin();
 }
 
-impl<'a, 'p> ReplayLink<'a, 'p> {
-    fn new(mut link: LinkCore<'a, System<'a>>, recorded: &Recorded, handle: PlayerHandle<'p>) -> Self {
+/// Times at which the telegrams of a recording are due.
+pub(crate) trait Pace<S: Platform> {
+    /// Returns the start of the played part, and its end if it is not that of the recording, as media times.
+    fn part(&self) -> (Nanos, Option<Nanos>);
+
+    /// Waits until a telegram of time `media` is due. Meanwhile, `link` publishes the status that `shown` describes.
+    /// Returns `None` if the hub must end.
+    fn wait_turn(&mut self, link: &mut LinkCore<'_, S>, media: Nanos, shown: Shown<'_>) -> Option<Due>;
+
+    /// Handles requests while telegrams are skipped. Returns whether to continue.
+    fn pass(&mut self, link: &mut LinkCore<'_, S>, problem: &str) -> bool;
+
+    /// Notes that a telegram of time `media` was published.
+    fn played(&mut self, media: Nanos);
+}
+
+/// Description of a link for its status.
+#[derive(Clone, Copy)]
+pub(crate) struct Shown<'a> {
+    session: Option<&'a PortSession>,
+    state: State,
+    /// Message about a problem; otherwise empty.
+    problem: &'a str,
+}
+
+/// A link that plays a recording at a [`Pace`].
+pub(crate) struct ReplayLink<'a, S: Platform, P> {
+    pub(crate) link: LinkCore<'a, S>,
+    pub(crate) pace: P,
+    /// Message about a problem of the recording; otherwise empty.
+    problem: String,
+}
+
+impl<'a, S: Platform, P: Pace<S>> ReplayLink<'a, S, P> {
+    pub(crate) fn new(mut link: LinkCore<'a, S>, recorded: &Recorded, pace: P) -> Self {
         link.output.topics.set_family(Some(recorded.family()));
         link.stats.set_family(recorded.family());
         link.stats.status_mut().set_sensor_type(recorded.sensor_type().unwrap_or_default());
         let problem = recorded.problem(&link.link.name);
-        ReplayLink { link, handle, problem, check_at: 0 }
+        ReplayLink { link, pace, problem }
     }
 
+    /// Sets the wall clock to that of the start of `recorded`.
+    pub(crate) fn set_begin(&mut self, recorded: &Recorded) {
+        if let Some(wall_ns) = recorded.begin_ns() {
+            self.link.output.topics.set_recorded_time(wall_ns, Flags::REPLAYED);
+        }
+    }
+
+    /// Resets the processors, as at the start of the hub.
+    fn restart(&mut self) {
+        self.link.output.restart(self.link.platform.now(), VALID_UNTIL_NEXT);
+    }
+
+    /// Waits until a telegram of time `media` is due. Meanwhile, the link publishes `state`. Returns `None` if the
+    /// hub must end.
+    fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
+        let shown = Shown { session, state, problem: &self.problem };
+        self.pace.wait_turn(&mut self.link, media, shown)
+    }
+
+    /// Handles requests while telegrams are skipped. Returns whether to continue.
+    fn pass(&mut self) -> bool {
+        self.pace.pass(&mut self.link, &self.problem)
+    }
+}
+
+/// One pass through a recording.
+pub(crate) enum Lap<'f> {
+    Bytes(Box<BytesLap<'f>>),
+    Frames(Box<FramesLap<'f>>),
+}
+
+impl<'f> Lap<'f> {
+    /// Starts a pass of `replay` through `recorded`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`](scanhub_schema::Kind) if the file cannot be opened.
+    pub(crate) fn new<S: Platform>(
+        replay: &ReplayLink<'_, S, impl Pace<S>>,
+        recorded: &'f Recorded,
+    ) -> Result<Lap<'f>, Failure> {
+        Ok(match recorded {
+            Recorded::Stream(stream) => Lap::Bytes(Box::new(BytesLap::new(replay, stream)?)),
+            Recorded::Frames(frames) => Lap::Frames(Box::new(FramesLap::new(replay, frames)?)),
+        })
+    }
+
+    /// Returns the media time of what [`step`](Self::step) plays next; `None` at the end.
+    pub(crate) fn next_media(&self) -> Option<Nanos> {
+        match self {
+            Lap::Bytes(lap) => lap.next_media(),
+            Lap::Frames(lap) => lap.next_media(),
+        }
+    }
+
+    /// Plays the next telegram, or the next few bytes of a stream. Returns `None` if the hub must end.
+    pub(crate) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
+        match self {
+            Lap::Bytes(lap) => lap.step(replay),
+            Lap::Frames(lap) => lap.step(replay),
+        }
+    }
+
+    /// Ends the pass. The last verdict stays valid for a while.
+    pub(crate) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) {
+        let lifetime = match self {
+            Lap::Bytes(lap) => lap.end(replay),
+            Lap::Frames(lap) => lap.end(replay),
+        };
+        expire_after(replay, lifetime);
+    }
+}
+
+/// Keeps the last verdict valid for `lifetime` from now on. `None` means that there was none.
+fn expire_after<S: Platform>(replay: &mut ReplayLink<'_, S, impl Pace<S>>, lifetime: Option<Nanos>) {
+    let now = replay.link.platform.now();
+    replay.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| now + lifetime));
+}
+
+impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
     /// Waits for a short time until a subscriber is attached: a user who starts a hub and a subscriber together wants
     /// the recording from its beginning.
     fn await_subscriber(&mut self) -> WakeReason {
@@ -110,7 +221,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
             }
             self.link.show(None, State::Starting, "");
             let next = (clock::now() + POLL_INTERVAL).min(until);
-            if self.rest(next) == WakeReason::Stop {
+            if self.pace.rest(&mut self.link, next) == WakeReason::Stop {
                 return WakeReason::Stop;
             }
         }
@@ -118,103 +229,77 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     }
 
     /// Plays `recorded`, lap by lap, until the hub ends.
-    fn play(&mut self, mut recorded: Recorded) {
-        let mut lap = 0;
-        if let Some(wall_ns) = recorded.begin_ns() {
-            self.link.output.topics.set_recorded_time(wall_ns, Flags::REPLAYED);
-        }
+    fn play(&mut self, recorded: &Recorded) {
+        let mut number = 0;
+        self.set_begin(recorded);
         loop {
-            self.check_at = 0;
-            let ended = match &mut recorded {
-                Recorded::Stream(stream) => self.play_stream(stream),
-                Recorded::Frames(frames) => frames::play(self, frames),
-            };
-            let Some(lifetime) = ended else { return };
-            self.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| clock::now() + lifetime));
+            self.pace.check_at = 0;
+            match Lap::new(self, recorded) {
+                Ok(mut lap) => {
+                    while lap.next_media().is_some() {
+                        if lap.step(self).is_none() {
+                            return;
+                        }
+                    }
+                    lap.end(self);
+                }
+                Err(failure) => {
+                    tracing::warn!("{}: {}", self.link.link.name, failure.message);
+                    expire_after(self, None);
+                }
+            }
             loop {
-                if let PlaybackAction::Restart(next) = self.handle.end(lap, clock::now()) {
-                    lap = next;
+                if let PlaybackAction::Restart(next) = self.pace.handle.end(number, clock::now()) {
+                    number = next;
                     self.restart();
                     break;
                 }
-                if self.rest(clock::now() + IDLE_INTERVAL) == WakeReason::Stop {
+                if self.pace.rest(&mut self.link, clock::now() + IDLE_INTERVAL) == WakeReason::Stop {
                     return;
                 }
                 self.link.show(None, State::Silent, "the recording is at its end");
             }
         }
     }
+}
 
-    /// Plays the bytes of `stream` at the pace of its scans. Returns how long the last verdict stays valid at the
-    /// end; `None` if the hub must end.
-    fn play_stream(&mut self, stream: &Stream) -> Option<Option<Nanos>> {
-        let play = self.handle.play();
-        let mut bytes = match stream.bytes() {
-            Ok(bytes) => bytes,
-            Err(failure) => {
-                tracing::warn!("{}: {}", self.link.link.name, failure.message);
-                return Some(None);
-            }
-        };
-        let link = self.link.link;
-        let settings = Settings { mode_number: stream.mode, ..link.settings() };
-        let mut session = PortSession::begin(Some(stream.family), &settings, None, clock::now());
-        let mut recorded = RecordedMetadata::default();
-        let (mut media, mut lifetime) = (0, None);
-        let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
-        loop {
-            if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
-                break;
-            }
-            let is_skipped = media < play.start_ns;
-            if is_skipped {
-                if !self.pass() {
-                    return None;
-                }
-            } else {
-                recorded.stretch = self.wait_turn(Some(&session), media, state)?.stretch;
-            }
-            let room = session.spare();
-            let chunk_len = room.len().min(CHUNK_LEN);
-            let len = read(&mut *bytes, &mut room[..chunk_len]);
-            let now = clock::now();
-            session.commit(now, len);
-            if len == 0 {
-                // Without further bytes, the session has no reason to hold a telegram back.
-                session.handle_timeout(now + HOLD_TIME);
-            }
-            while let Output::Event(Event::Telegram(received)) = session.poll_output() {
-                if !is_skipped {
-                    recorded.measured_ns = Some(media);
-                    lifetime = self.link.publish(&received, &recorded, false).or(lifetime);
-                    self.link.output.extend_verdict(VALID_UNTIL_NEXT);
-                    self.handle.played(media);
-                } else if let Some(scan) = received.whole.and_then(|whole| whole.scan) {
-                    self.link.output.learn(&scan, media);
-                }
-                if !received.is_reply {
-                    media += stream.period(received.whole.map_or(0, |whole| whole.beams));
-                }
-            }
-            if !is_skipped {
-                self.link.show(Some(&session), state, &self.problem);
-            }
-            if len == 0 {
-                break;
-            }
+/// Pace of the player of a hub.
+struct PlayerPace<'p> {
+    handle: PlayerHandle<'p>,
+    /// Time of the next check for requests while the link plays without a wait.
+    check_at: Nanos,
+}
+
+impl<'p> PlayerPace<'p> {
+    fn new(handle: PlayerHandle<'p>) -> Self {
+        PlayerPace { handle, check_at: 0 }
+    }
+
+    /// Waits until `until`, the end of the hub, or a change of the player.
+    fn rest(&mut self, link: &mut LinkCore<'_, System<'_>>, until: Nanos) -> WakeReason {
+        let event = self.handle.event();
+        match link.wait(event.as_fd(), until) {
+            WakeReason::Request => link.handle_requests(PauseTarget::Recording(self.handle.player)),
+            WakeReason::Ready => event.clear(),
+            WakeReason::Stop => return WakeReason::Stop,
+            WakeReason::Timeout => {}
         }
-        self.link.stats.close(&session);
-        Some(lifetime)
+        WakeReason::Timeout
+    }
+}
+
+impl<'a> Pace<System<'a>> for PlayerPace<'_> {
+    fn part(&self) -> (Nanos, Option<Nanos>) {
+        let play = self.handle.play();
+        (play.start_ns, play.end_ns)
     }
 
-    /// Resets the processors, as at the start of the hub.
-    fn restart(&mut self) {
-        self.link.output.restart(clock::now(), VALID_UNTIL_NEXT);
-    }
-
-    /// Waits until a telegram of time `media` is due. Meanwhile, the link publishes `state`. Returns `None` if the
-    /// hub must end.
-    fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
+    fn wait_turn(
+        &mut self,
+        link: &mut LinkCore<'_, System<'a>>,
+        media: Nanos,
+        shown: Shown<'_>,
+    ) -> Option<Due> {
         loop {
             let now = clock::now();
             if self.handle.is_unthrottled() && now < self.check_at {
@@ -229,36 +314,27 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
                 | PlaybackAction::Skipped
                 | PlaybackAction::Over => now + IDLE_INTERVAL,
             };
-            if self.rest(until) == WakeReason::Stop {
+            if self.rest(link, until) == WakeReason::Stop {
                 return None;
             }
             self.check_at = clock::now() + POLL_INTERVAL;
-            let state = if self.handle.is_paused() { State::Paused } else { state };
-            self.link.show(session, state, &self.problem);
+            let state = if self.handle.is_paused() { State::Paused } else { shown.state };
+            link.show(shown.session, state, shown.problem);
         }
     }
 
-    /// Handles requests while telegrams are skipped. Returns whether to continue.
-    fn pass(&mut self) -> bool {
+    fn pass(&mut self, link: &mut LinkCore<'_, System<'a>>, problem: &str) -> bool {
         let now = clock::now();
         if now < self.check_at {
             return true;
         }
         self.check_at = now + POLL_INTERVAL;
-        self.link.show(None, State::Starting, &self.problem);
-        self.rest(0) != WakeReason::Stop
+        link.show(None, State::Starting, problem);
+        self.rest(link, 0) != WakeReason::Stop
     }
 
-    /// Waits until `until`, the end of the hub, or a change of the player.
-    fn rest(&mut self, until: Nanos) -> WakeReason {
-        let event = self.handle.event();
-        match self.link.wait(event.as_fd(), until) {
-            WakeReason::Request => self.link.handle_requests(PauseTarget::Recording(self.handle.player)),
-            WakeReason::Ready => event.clear(),
-            WakeReason::Stop => return WakeReason::Stop,
-            WakeReason::Timeout => {}
-        }
-        WakeReason::Timeout
+    fn played(&mut self, media: Nanos) {
+        self.handle.played(media);
     }
 }
 
@@ -361,9 +437,5 @@ const FIRST_SUBSCRIBER_TIMEOUT: Nanos = 1_000 * MILLIS;
 const OTHER_TOPICS_TIME: Nanos = 100 * MILLIS;
 /// Interval of the checks for requests and the end of the hub while a link plays without a wait.
 const POLL_INTERVAL: Nanos = 5 * MILLIS;
-/// Maximum number of bytes given to the session at a time: less than a telegram, so that stamps stay accurate.
-const CHUNK_LEN: usize = 128;
-/// Time without bytes after which a session no longer holds a telegram back.
-const HOLD_TIME: Nanos = 100 * MILLIS;
 /// Interval at which a mount checks whether the player was paused, or has ended.
 const ANGLE_POLL_INTERVAL: Duration = Duration::from_millis(5);

@@ -1,4 +1,5 @@
 //! A hub that plays a recording: finds the sensors in it and their configuration, and creates one player for all links.
+//! `reader.rs` uses the same sensors and configuration without a hub.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -47,28 +48,16 @@ pub fn replay(
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
     let recording = Recording::open_as(file, replay.family)?;
-    log_damage(&recording);
-    let sensors = sensors(&recording, replay.sensor)?;
-    let read = || configuration(sources, &sensors, file);
-    let config = read()?;
-    let (links, left_out) = (config.links.len(), left_out(sources, &sensors, &config)?);
+    let set = RecordedSet::new(recording, replay.sensor, sources)?;
+    let (links, left_out) = (set.config.links.len(), left_out(sources, &set.sensors, &set.config)?);
     for name in left_out {
         tracing::info!("{name}: not in the recording, left out");
     }
-    let mut parts = Vec::with_capacity(links);
-    for link in &config.links {
-        let of = sensors.iter().find(|sensor| sensor.link == link.name);
-        let part = match of.and_then(|sensor| sensor.recorded.as_deref()) {
-            Some(name) => recording.of(name)?,
-            None => recording.clone(),
-        };
-        parts.push(Recorded::new(part, link)?);
-    }
-    let mut mounts = Vec::new();
-    if let Some(origin) = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier) {
-        parts.iter_mut().for_each(|part| part.set_origin(origin));
-        mounts = self::mounts(&recording, replay.sensor, origin, &config)?;
-    }
+    let mounts = match set.origin {
+        Some(origin) => mounts(&set.recording, replay.sensor, origin, &set.config)?,
+        None => Vec::new(),
+    };
+    let RecordedSet { sensors, config, parts, .. } = set;
     let length = parts.iter().filter_map(Recorded::length).max();
     let start_ns = replay.play.start_ns;
     if length.is_some_and(|length| start_ns > length) {
@@ -83,6 +72,7 @@ pub fn replay(
         }
     }
     let player = Arc::new(Player::new(replay.play, links, length)?.with_mounts(mounts));
+    let read = || configuration(sources, &sensors, file);
     let set = ReplaySet { player: &player, parts, holds: replay.holds };
     supervise::serve(&read, config, Some(set), domain, |ready| on_ready(ready, &player))?;
     Ok(player.progress())
@@ -93,6 +83,48 @@ fn start_after_end(file: &Path, start_ns: Nanos, end_ns: Nanos) -> Failure {
     let message =
         format!("--start {start_s} s is after the end of {}, which lasts {end_s:.3} s", file.display());
     Failure::new(Kind::Usage, message, "it counts from the first telegram")
+}
+
+/// Sensors of a recording, with a link for each.
+pub(crate) struct RecordedSet {
+    pub(crate) recording: Recording,
+    sensors: Vec<Sensor>,
+    pub(crate) config: Config,
+    /// Recording of each link.
+    pub(crate) parts: Vec<Recorded>,
+    /// Start of the media time; `None` without stamps.
+    pub(crate) origin: Option<Origin>,
+}
+
+impl RecordedSet {
+    /// Creates the links of the sensors in `recording`, or of `sensor` alone, with the configuration in `sources`.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`replay`] about the recording, the sensor and the configuration.
+    pub(crate) fn new(
+        recording: Recording,
+        sensor: Option<&str>,
+        sources: &Sources,
+    ) -> Result<RecordedSet, Failure> {
+        log_damage(&recording);
+        let sensors = sensors(&recording, sensor)?;
+        let config = configuration(sources, &sensors, recording.path())?;
+        let mut parts = Vec::with_capacity(config.links.len());
+        for link in &config.links {
+            let of = sensors.iter().find(|sensor| sensor.link == link.name);
+            let part = match of.and_then(|sensor| sensor.recorded.as_deref()) {
+                Some(name) => recording.of(name)?,
+                None => recording.clone(),
+            };
+            parts.push(Recorded::new(part, link)?);
+        }
+        let origin = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier);
+        if let Some(origin) = origin {
+            parts.iter_mut().for_each(|part| part.set_origin(origin));
+        }
+        Ok(RecordedSet { recording, sensors, config, parts, origin })
+    }
 }
 
 /// Sensor that is played.

@@ -153,7 +153,7 @@ impl<'a> System<'a> {
     }
 }
 
-impl<'a> LinkCore<'a, System<'a>> {
+impl LinkCore<'_, System<'_>> {
     /// Waits until `event` is readable, for a request, or the end of the hub, at most until `until`. Meanwhile,
     /// publishes what is due.
     pub(crate) fn wait(&mut self, event: BorrowedFd<'_>, until: Nanos) -> WakeReason {

@@ -5,80 +5,31 @@
 //! in the time of the recording. It builds the same scans as the hub that recorded them, with the same times between
 //! them.
 
+use std::iter::Peekable;
+
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
 use scanhub_recording::{Frame, VirtualTime};
-use scanhub_schema::{Flags, Header, MILLIS, Nanos, State};
+use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State};
 
-use super::recorded::Frames;
-use super::{MAX_GAP, ReplayLink, VALID_UNTIL_NEXT};
+use super::recorded::{Frames, Timeline};
+use super::{MAX_GAP, Pace, ReplayLink, VALID_UNTIL_NEXT};
 use crate::link_output::{RecordedMetadata, micros, verdict_lifetime};
+use crate::platform::Platform;
 use crate::player::Due;
 
-/// Plays `frames` into the topics of `replay`. Returns how long the last verdict stays valid at the end; `None` if the
-/// hub must end.
-pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<Option<Nanos>> {
-    let play = replay.handle.play();
-    let mut read = match frames.read() {
-        Ok(read) => read.peekable(),
-        Err(failure) => {
-            tracing::warn!("{}: {}", replay.link.link.name, failure.message);
-            return Some(None);
-        }
-    };
-    let mut timeline = frames.timeline();
-    let mut lap = Lap {
-        frames,
-        start_ns: play.start_ns,
-        run: None,
-        has_begun: false,
-        understood_from: 0,
-        session: None,
-        last_stamp: 0,
-        verdict: None,
-        limit: None,
-        state: if frames.is_whole { State::Streaming } else { State::Starting },
-    };
-    let mut foreign = 0_u64;
-    while let Some(frame) = read.next() {
-        if frame.header.is_some_and(|header| header.family != frames.family as u8) {
-            foreign += 1;
-            continue;
-        }
-        let media = timeline.media(&frame);
-        if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
-            break;
-        }
-        let when = When::of(&frame, media, media < play.start_ns);
-        lap.note_silence(replay, when)?;
-        lap.note_run(replay, &frame, when);
-        if !frames.is_whole {
-            lap.play_packets(replay, &frame, when)?;
-            continue;
-        }
-        let beams = lap.play_telegram(replay, &frame, read.peek(), when)?;
-        if !frames.has_stamps() && frame.is_scan() {
-            timeline.pass(frames.period(beams));
-        }
-    }
-    if foreign > 0 {
-        tracing::warn!(
-            "{}: {foreign} telegrams are of a scanner of another family, and are not played: only those of family {} are",
-            replay.link.link.name,
-            frames.family.name()
-        );
-    }
-    if let Some(session) = lap.shown_session() {
-        replay.link.stats.close(session);
-    }
-    Some(lap.limit)
-}
-
-/// State while the recording is played once.
-struct Lap<'f> {
+/// One pass through telegrams or packets.
+pub(crate) struct FramesLap<'f> {
     frames: &'f Frames,
-    /// Media time before which frames are only learned from, not published.
+    read: Peekable<Box<dyn Iterator<Item = Frame> + Send>>,
+    timeline: Timeline,
+    /// The next frame and its media time; `None` at the end.
+    next: Option<(Frame, Nanos)>,
+    /// Media times between which frames are published. Those before are only learned from.
     start_ns: Nanos,
+    end_ns: Option<Nanos>,
+    /// Frames of a scanner of another family.
+    foreign: u64,
     /// Run of the hub that recorded the last frame.
     run: Option<u64>,
     has_begun: bool,
@@ -119,10 +70,94 @@ struct When {
     is_skipped: bool,
 }
 
-impl Lap<'_> {
+impl<'f> FramesLap<'f> {
+    /// Starts a pass of `replay` through `frames`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`](scanhub_schema::Kind) if the file cannot be opened.
+    pub(super) fn new<S: Platform>(
+        replay: &ReplayLink<'_, S, impl Pace<S>>,
+        frames: &'f Frames,
+    ) -> Result<Self, Failure> {
+        let (start_ns, end_ns) = replay.pace.part();
+        let mut lap = FramesLap {
+            frames,
+            read: frames.read()?.peekable(),
+            timeline: frames.timeline(),
+            next: None,
+            start_ns,
+            end_ns,
+            foreign: 0,
+            run: None,
+            has_begun: false,
+            understood_from: 0,
+            session: None,
+            last_stamp: 0,
+            verdict: None,
+            limit: None,
+            state: if frames.is_whole { State::Streaming } else { State::Starting },
+        };
+        lap.advance();
+        Ok(lap)
+    }
+
+    pub(super) fn next_media(&self) -> Option<Nanos> {
+        self.next.as_ref().map(|(_, media)| *media)
+    }
+
+    pub(super) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
+        let Some((frame, media)) = self.next.take() else { return Some(()) };
+        let when = When::of(&frame, media, media < self.start_ns);
+        self.note_silence(replay, when)?;
+        self.note_run(replay, &frame, when);
+        if self.frames.is_whole {
+            let beams = self.play_telegram(replay, &frame, when)?;
+            if !self.frames.has_stamps() && frame.is_scan() {
+                self.timeline.pass(self.frames.period(beams));
+            }
+        } else {
+            self.play_packets(replay, &frame, when)?;
+        }
+        self.advance();
+        Some(())
+    }
+
+    /// Returns how long the last verdict stays valid.
+    pub(super) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<Nanos> {
+        if self.foreign > 0 {
+            tracing::warn!(
+                "{}: {} telegrams are of a scanner of another family, and are not played: only those of family {} are",
+                replay.link.link.name,
+                self.foreign,
+                self.frames.family.name()
+            );
+        }
+        if let Some(session) = self.shown_session() {
+            replay.link.stats.close(session);
+        }
+        self.limit
+    }
+
+    /// Reads the next frame of the scanner's family.
+    fn advance(&mut self) {
+        self.next = None;
+        for frame in self.read.by_ref() {
+            if frame.header.is_some_and(|header| header.family != self.frames.family as u8) {
+                self.foreign += 1;
+                continue;
+            }
+            let media = self.timeline.media(&frame);
+            if self.end_ns.is_none_or(|end_ns| media < end_ns) {
+                self.next = Some((frame, media));
+            }
+            return;
+        }
+    }
+
     /// Publishes that the last verdict is stale, if its validity ended before the frame at `when`. Returns `None` if
     /// the hub must end.
-    fn note_silence(&mut self, replay: &mut ReplayLink<'_, '_>, when: When) -> Option<()> {
+    fn note_silence<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, when: When) -> Option<()> {
         let Some(silence) = self.verdict.take_if(|verdict| when.last > verdict.until_ns) else {
             return Some(());
         };
@@ -141,7 +176,7 @@ impl Lap<'_> {
     }
 
     /// Forgets everything if another run of the hub recorded `frame`, because a hub knows nothing at its start.
-    fn note_run(&mut self, replay: &mut ReplayLink<'_, '_>, frame: &Frame, when: When) {
+    fn note_run<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, frame: &Frame, when: When) {
         let run = frame.header.map(|header| header.boot);
         if !self.has_begun || self.run != run {
             if std::mem::replace(&mut self.has_begun, true) {
@@ -169,7 +204,7 @@ impl Lap<'_> {
     }
 
     /// Waits until the frame at `when` is due: `Some(None)` if it is skipped, `None` if the hub must end.
-    fn wait(&mut self, replay: &mut ReplayLink<'_, '_>, when: When) -> Option<Option<Due>> {
+    fn wait<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, when: When) -> Option<Option<Due>> {
         if when.is_skipped {
             return replay.pass().then_some(None);
         }
@@ -178,13 +213,12 @@ impl Lap<'_> {
         Some(Some(due))
     }
 
-    /// Plays a whole telegram; the frame after it is known, too. Returns the number of beams of its measured data, or
+    /// Plays a whole telegram. Returns the number of beams of its measured data, or
     /// `None` if the hub must end.
-    fn play_telegram(
+    fn play_telegram<S: Platform>(
         &mut self,
-        replay: &mut ReplayLink<'_, '_>,
+        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
         frame: &Frame,
-        next: Option<&Frame>,
         when: When,
     ) -> Option<usize> {
         let due = self.wait(replay, when)?;
@@ -208,7 +242,7 @@ impl Lap<'_> {
                     ..received
                 };
                 replay.link.stats.note_recorded(received.bytes.len());
-                let gap = next.and_then(|next| gap(frame, next));
+                let gap = self.read.peek().and_then(|next| gap(frame, next));
                 let recorded = RecordedMetadata {
                     period_us: header.map(|header| header.period_us),
                     gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
@@ -218,7 +252,7 @@ impl Lap<'_> {
                 };
                 self.limit = replay.link.publish(&received, &recorded, false).or(self.limit);
                 replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
-                replay.handle.played(when.begin);
+                replay.pace.played(when.begin);
                 self.state = State::Streaming;
                 replay.link.show(None, self.state, &replay.problem);
             }
@@ -231,7 +265,7 @@ impl Lap<'_> {
     }
 
     /// Plays packets of a rotating scanner, and the revolutions that end with them. Returns `None` if the hub must end.
-    fn play_packets(&mut self, replay: &mut ReplayLink<'_, '_>, frame: &Frame, when: When) -> Option<()> {
+    fn play_packets<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, frame: &Frame, when: When) -> Option<()> {
         let at = self.wait(replay, when)?.map(|due| {
             let recorded = RecordedMetadata { stretch: due.stretch, ..recorded(frame) };
             (self.last_stamp, recorded)
@@ -249,9 +283,9 @@ impl Lap<'_> {
                 whole: None,
             };
             replay.link.publish(&received, recorded, false);
-            replay.handle.played(when.begin);
+            replay.pace.played(when.begin);
         }
-        let Lap { session, verdict, limit: last_limit, state, .. } = self;
+        let FramesLap { session, verdict, limit: last_limit, state, .. } = self;
         let session = session.as_mut()?;
         // As on a line, an error of the line concerns the packets alone, not the revolution.
         session.session_mut().mark_suspect(frame.reasons & !suspect::LINE_ERROR);
@@ -320,4 +354,4 @@ fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
 /// A scanner is silent after this time without a scan.
 const SILENCE: Nanos = 1_000 * MILLIS;
 /// Time at which the clock of a frame without stamps starts: that of a machine that has run for a while.
-const BEGIN: Nanos = 10_000_000_000;
+pub(crate) const BEGIN: Nanos = 10_000_000_000;

@@ -49,7 +49,7 @@ pub(crate) struct Origin {
     /// Wall clock, in ns since 1970.
     pub(crate) wall_ns: u64,
     /// Run of the hub and its monotonic clock, because a wall clock may be set.
-    run: Option<(u64, Nanos)>,
+    pub(crate) run: Option<(u64, Nanos)>,
 }
 
 impl Recorded {
@@ -148,7 +148,7 @@ impl Recorded {
     }
 
     /// Returns a message if no scan of the recording can be read; otherwise an empty string.
-    pub(super) fn problem(&self, name: &str) -> String {
+    pub(crate) fn problem(&self, name: &str) -> String {
         let (Recorded::Stream(Stream { mode, recording, .. })
         | Recorded::Frames(Frames { mode, recording, .. })) = self;
         if recording.contents().telegrams == 0 {

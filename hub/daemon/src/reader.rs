@@ -1,0 +1,455 @@
+//! Reads a recording without a hub: the code of a replay computes the samples, and this process has them in its memory.
+//!
+//! A link plays each sensor, as in [`replay`](crate::replay) at maximum rate, so that payloads are equal bit for bit.
+//! Nothing waits, and there is no thread. [`RecordingReader::step`] plays the next telegram of the sensor that has the
+//! earliest one, and publishes its samples into a queue. Memory is for these samples, not for the file.
+
+use std::borrow::{Borrow, BorrowMut};
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::fmt::Debug;
+use std::io;
+use std::marker::PhantomData;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytemuck::cast_slice_mut;
+use scanhub_config::{Config, Sources};
+use scanhub_port::{Allowance, Alteration, PortError, Source};
+use scanhub_recording::Recording;
+use scanhub_schema::{Failure, Family, Header, Kind, Nanos, Ring, Topic, Wake};
+use scanhub_shm::{LoanError, Medium, Payload, SendError};
+use self_cell::self_cell;
+
+use crate::control::CommandSender;
+use crate::link::LinkCore;
+use crate::platform::{Line, Platform, SavedState};
+use crate::player::Due;
+use crate::replay::{self, BEGIN, Lap, Pace, Recorded, ReplayLink, Shown};
+use crate::replay_hub::RecordedSet;
+
+/// Options of a [`RecordingReader`].
+#[derive(Clone, Copy, Debug)]
+pub struct ReadOptions<'a> {
+    /// The recording.
+    pub file: &'a Path,
+    /// Only sensor to read. For a recording that has no sensor names, the name that its sensor gets.
+    pub sensor: Option<&'a str>,
+    /// Family of a stream file; `None` if it is recognized by the bytes.
+    pub family: Option<Family>,
+    /// Configuration of its sensors.
+    pub sources: &'a Sources,
+    /// Topics to read.
+    pub topics: &'a [Topic],
+}
+
+/// Reader of a recording.
+///
+/// Stamps are by the clock of the hub that made the recording. If it has several runs of the hub, this is the clock of
+/// the first one. A recording without stamps starts at 10 s.
+pub struct RecordingReader {
+    links: OwnedLinks,
+    queue: Arc<Queue>,
+    recording: Recording,
+}
+
+/// A sample that was computed from a recording.
+#[derive(Debug)]
+pub struct ReadSample {
+    /// Name of the sensor.
+    pub sensor: Arc<str>,
+    /// Topic of the sample.
+    pub topic: Topic,
+    /// Header of the sample.
+    pub header: Header,
+    /// The payload, filled up to whole words with zeros.
+    pub words: Vec<u64>,
+    /// Number of bytes of the payload.
+    pub len: usize,
+}
+
+self_cell!(
+    struct OwnedLinks {
+        owner: Parts,
+        #[not_covariant]
+        dependent: Links,
+    }
+);
+
+/// What links borrow.
+struct Parts {
+    config: Config,
+    recorded: Vec<Recorded>,
+    platforms: Vec<MemoryPlatform>,
+}
+
+type Links<'a> = Vec<ReadLink<'a>>;
+
+impl RecordingReader {
+    /// Opens a recording. This reads the file to its end once.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor or a topic is
+    /// not computed from telegrams, and [`Kind::Configuration`] if it contradicts the configuration. Returns
+    /// [`Kind::Short`] if no descriptors are left.
+    pub fn open(options: &ReadOptions<'_>) -> Result<RecordingReader, Failure> {
+        for topic in options.topics {
+            check(*topic)?;
+        }
+        let recording = Recording::open_as(options.file, options.family)?;
+        let RecordedSet { recording, config, parts, origin, .. } =
+            RecordedSet::new(recording, options.sensor, options.sources)?;
+        let queue = Arc::new(Queue::default());
+        let (boot, begin) = origin.and_then(|origin| origin.run).unwrap_or((0, BEGIN));
+        let begin_wall_ns = origin.map_or(begin, |origin| origin.wall_ns);
+        let platform = |name: &str| MemoryPlatform {
+            sensor: name.into(),
+            topics: options.topics.to_vec(),
+            queue: queue.clone(),
+            begin,
+            begin_wall_ns,
+            now: AtomicU64::new(begin),
+        };
+        let platforms = config.links.iter().map(|link| platform(&link.name)).collect();
+        let parts = Parts { config, recorded: parts, platforms };
+        let links = OwnedLinks::try_new(parts, |parts| links(parts, boot))?;
+        Ok(RecordingReader { links, queue, recording })
+    }
+
+    /// Returns the names of the sensors that are read.
+    pub fn sensors(&self) -> Vec<&str> {
+        self.links.borrow_owner().config.links.iter().map(|link| link.name.as_str()).collect()
+    }
+
+    /// Returns messages about the recording: damage, and values that cannot be read.
+    pub fn problems(&self) -> Vec<String> {
+        let damage = self.recording.contents().damage;
+        let damage = (!damage.is_none()).then(|| format!("missing: {damage}"));
+        let Parts { config, recorded, .. } = self.links.borrow_owner();
+        let of_links = recorded.iter().zip(&config.links).map(|(part, link)| part.problem(&link.name));
+        damage.into_iter().chain(of_links.filter(|problem| !problem.is_empty())).collect()
+    }
+
+    /// Plays the next telegram, or a few bytes of a stream. Returns whether there was any.
+    pub fn step(&mut self) -> bool {
+        self.links.with_dependent_mut(|_, links| {
+            let next = links.iter_mut().filter_map(|link| Some((link.next_media()?, link)));
+            let Some((_, link)) = next.min_by_key(|(media, _)| *media) else { return false };
+            link.step();
+            true
+        })
+    }
+
+    /// Returns the oldest sample of the last steps that was not returned yet.
+    pub fn take(&mut self) -> Option<ReadSample> {
+        self.queue.0.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
+    }
+}
+
+/// Samples are taken as long as there are any, one telegram after the other.
+impl Iterator for RecordingReader {
+    type Item = ReadSample;
+
+    fn next(&mut self) -> Option<ReadSample> {
+        loop {
+            if let Some(sample) = self.take() {
+                return Some(sample);
+            }
+            if !self.step() {
+                return None;
+            }
+        }
+    }
+}
+
+/// Checks that a replay publishes `topic`.
+fn check(topic: Topic) -> Result<(), Failure> {
+    if COMPUTED.contains(&topic) {
+        return Ok(());
+    }
+    let names: Vec<_> = COMPUTED.iter().map(|topic| topic.name()).collect();
+    let message = format!("{} is not computed from a recording", topic.name());
+    Err(Failure::new(Kind::NoTopic, message, format!("the topics are {}", names.join(", "))))
+}
+
+fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
+    let Parts { config, recorded, platforms } = parts;
+    let (_, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;
+    let mut links = Vec::with_capacity(queues.len());
+    for (number, ((link, queue), (recorded, platform))) in
+        config.links.iter().zip(queues).zip(recorded.iter().zip(platforms)).enumerate()
+    {
+        let mut core = LinkCore::new(link, number as u8, boot, platform, queue)?;
+        replay::begin(&mut core);
+        let mut replay = ReplayLink::new(core, recorded, AtOnce);
+        replay.set_begin(recorded);
+        let lap = Lap::new(&replay, recorded)?;
+        links.push(ReadLink { replay, phase: Phase::Playing(lap) });
+    }
+    Ok(links)
+}
+
+/// Link of one sensor.
+struct ReadLink<'a> {
+    replay: ReplayLink<'a, MemoryPlatform, AtOnce>,
+    phase: Phase<'a>,
+}
+
+enum Phase<'a> {
+    Playing(Lap<'a>),
+    /// All was played, and the last verdict becomes stale at this media time.
+    Expiring(Nanos),
+    Over,
+}
+
+impl ReadLink<'_> {
+    /// Returns the media time of the next step; `None` at the end.
+    fn next_media(&self) -> Option<Nanos> {
+        match &self.phase {
+            // A lap that is over is ended by a step at once.
+            Phase::Playing(lap) => Some(lap.next_media().unwrap_or(0)),
+            Phase::Expiring(media) => Some(*media),
+            Phase::Over => None,
+        }
+    }
+
+    fn step(&mut self) {
+        let platform = self.replay.link.platform;
+        match &mut self.phase {
+            Phase::Playing(lap) if lap.next_media().is_some() => drop(lap.step(&mut self.replay)),
+            Phase::Playing(lap) => {
+                lap.end(&mut self.replay);
+                let stale_at = self.replay.link.output.stale_at();
+                self.phase = match stale_at {
+                    Nanos::MAX => Phase::Over,
+                    _ => Phase::Expiring(stale_at - platform.begin),
+                };
+            }
+            Phase::Expiring(media) => {
+                let now = platform.advance(*media);
+                self.replay.link.output.expire_verdict(now, Nanos::MAX);
+                self.phase = Phase::Over;
+            }
+            Phase::Over => {}
+        }
+    }
+}
+
+/// Pace at which every telegram is due at once, at its recorded time.
+struct AtOnce;
+
+impl Pace<MemoryPlatform> for AtOnce {
+    fn part(&self) -> (Nanos, Option<Nanos>) {
+        (0, None)
+    }
+
+    fn wait_turn(
+        &mut self,
+        link: &mut LinkCore<'_, MemoryPlatform>,
+        media: Nanos,
+        _: Shown<'_>,
+    ) -> Option<Due> {
+        Some(Due::at_once(link.platform.advance(media)))
+    }
+
+    fn pass(&mut self, _: &mut LinkCore<'_, MemoryPlatform>, _: &str) -> bool {
+        true
+    }
+
+    fn played(&mut self, _: Nanos) {}
+}
+
+/// Samples that were published and not taken.
+#[derive(Default)]
+struct Queue(Mutex<VecDeque<ReadSample>>);
+
+/// Platform of a link whose topics are in the memory of this process, and whose clock is that of the recording.
+struct MemoryPlatform {
+    sensor: Arc<str>,
+    /// Topics that have a subscriber.
+    topics: Vec<Topic>,
+    queue: Arc<Queue>,
+    /// Both clocks at media time 0.
+    begin: Nanos,
+    begin_wall_ns: u64,
+    now: AtomicU64,
+}
+
+impl MemoryPlatform {
+    /// Sets the clock to media time `media`, unless it is later already. Returns its time.
+    fn advance(&self, media: Nanos) -> Nanos {
+        let now = self.begin.saturating_add(media).max(self.now());
+        self.now.store(now, Ordering::Relaxed);
+        now
+    }
+}
+
+impl Platform for MemoryPlatform {
+    type Line = Infallible;
+    type Medium<P: Payload + ?Sized> = MemoryTopic<P>;
+
+    fn now(&self) -> Nanos {
+        self.now.load(Ordering::Relaxed)
+    }
+
+    fn wall_ns(&self) -> u64 {
+        self.begin_wall_ns.saturating_add(self.now() - self.begin)
+    }
+
+    fn pause(&self, _: Nanos) {}
+
+    fn take_name(&self) -> Result<(), Failure> {
+        Ok(())
+    }
+
+    fn open(&self, _: &Source, _: u32) -> Option<Result<Infallible, PortError>> {
+        None
+    }
+
+    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+        error.explain(source)
+    }
+
+    fn altering_program(&self, _: &Source) -> Option<String> {
+        None
+    }
+
+    fn take_kept(&self, _: &str, _: &Source, _: u32) -> Option<Infallible> {
+        None
+    }
+
+    fn keep(&self, _: &str, _: &Infallible) {}
+
+    fn release(&self, _: &str) {}
+
+    fn medium<P: Payload + ?Sized>(&self, _: &str) -> Result<MemoryTopic<P>, Failure> {
+        let queue = self.topics.contains(&P::TOPIC).then(|| self.queue.clone());
+        Ok(MemoryTopic { sensor: self.sensor.clone(), queue, payload: PhantomData })
+    }
+
+    fn attached(&self) -> Option<u32> {
+        // The subscribers are the same from the start.
+        Some(0)
+    }
+
+    fn has_listeners(&self) -> bool {
+        false
+    }
+
+    fn ring(&self, _: Ring) {}
+
+    fn notify_event(&self, _: Wake) {}
+
+    fn load_record(&self, _: &str, _: &mut [u8]) -> Option<usize> {
+        None
+    }
+
+    fn store_record(&self, _: &str, _: &[u8]) {}
+
+    fn saved_state(&self) -> Option<&dyn SavedState> {
+        None
+    }
+}
+
+/// A topic in the memory of this process.
+struct MemoryTopic<P: ?Sized> {
+    sensor: Arc<str>,
+    /// Queue of the only subscriber, if there is one.
+    queue: Option<Arc<Queue>>,
+    payload: PhantomData<fn(&P)>,
+}
+
+impl<P: Payload + ?Sized> Medium<P> for MemoryTopic<P> {
+    type Loan = P::Owned;
+
+    fn subscribers(&self) -> usize {
+        usize::from(self.queue.is_some())
+    }
+
+    fn connect(&self) -> Result<(), impl Debug + use<P>> {
+        Ok::<(), Infallible>(())
+    }
+
+    fn loan(&self, len: usize) -> Result<P::Owned, LoanError> {
+        Ok(P::owned(len))
+    }
+
+    fn payload_mut(loan: &mut P::Owned) -> &mut P {
+        loan.borrow_mut()
+    }
+
+    fn send(&self, loan: P::Owned, header: &Header) -> Result<usize, SendError> {
+        if let Some(queue) = &self.queue {
+            let payload: &P = loan.borrow();
+            let bytes = payload.bytes();
+            let (mut words, len) = (vec![0; bytes.len().div_ceil(8)], bytes.len());
+            cast_slice_mut(&mut words)[..len].copy_from_slice(bytes);
+            let (sensor, header) = (self.sensor.clone(), *header);
+            let sample = ReadSample { sensor, topic: P::TOPIC, header, words, len };
+            queue.0.lock().unwrap_or_else(PoisonError::into_inner).push_back(sample);
+        }
+        Ok(self.subscribers())
+    }
+}
+
+/// A recording has no line.
+impl Line for Infallible {
+    fn read(&self, _: &mut [u8]) -> io::Result<usize> {
+        match *self {}
+    }
+
+    fn write(&self, _: &[u8]) -> io::Result<()> {
+        match *self {}
+    }
+
+    fn set_baud(&self, _: u32) -> io::Result<Option<io::Error>> {
+        match *self {}
+    }
+
+    fn altered(&self) -> io::Result<Option<Alteration>> {
+        match *self {}
+    }
+
+    fn restore(&self, _: u32) -> io::Result<()> {
+        match *self {}
+    }
+
+    fn set_dtr(&self, _: bool) -> io::Result<()> {
+        match *self {}
+    }
+
+    fn waiting(&self) -> Option<usize> {
+        match *self {}
+    }
+
+    fn allowance(&self, _: u32) -> Option<Allowance> {
+        match *self {}
+    }
+
+    fn line_errors(&self) -> u64 {
+        match *self {}
+    }
+
+    fn device(&self) -> Option<&Path> {
+        match *self {}
+    }
+
+    fn is_simulated(&self) -> bool {
+        match *self {}
+    }
+}
+
+/// Topics that a link publishes from telegrams. Early warnings need parts of telegrams.
+const COMPUTED: [Topic; 9] = [
+    Topic::Telegram,
+    Topic::Scan,
+    Topic::Marks,
+    Topic::Zones,
+    Topic::Foreground,
+    Topic::Background,
+    Topic::Status,
+    Topic::Lines,
+    Topic::Motion,
+];
