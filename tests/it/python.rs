@@ -1,6 +1,8 @@
 //! The Python package next to a hub. Scripts check what only Python can see, and the tests compare the samples that they follow
 //! with those of `echo`. The tests skip if there is no Python with the package of this commit.
 
+mod read;
+
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};

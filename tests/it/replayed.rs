@@ -15,6 +15,7 @@ use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
 use scanhub_config::Sources;
 use scanhub_daemon::{PlaybackOptions, Player, Replay};
 use scanhub_schema::{Flags, Topic};
+use scanhub_shm::{Domain, Node};
 
 const SCANS: u64 = 400;
 /// Before this scan nothing is heard of a sensor for a second.
@@ -33,55 +34,66 @@ fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
 fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<Published>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
-    let replay = Replay {
-        file,
-        sensor: None,
-        family: None,
-        sources: &sources,
-        play: PlaybackOptions { is_paused: true, ..play },
-        holds: false,
-    };
-    let domain = env.place();
+    let replay = Replay { file, sensor: None, family: None, sources: &sources, play, holds: false };
+    let mut published = vec![Vec::new(), Vec::new()];
+    let mut telegrams = 0;
+    step_through(
+        &env.place(),
+        &replay,
+        |node| SENSORS.map(|(name, _)| Subscribers::attach(node, name)),
+        |followers| {
+            for (followers, published) in followers.iter().zip(&mut published) {
+                let samples = followers.take();
+                telegrams += samples.iter().filter(|sample| sample.topic == Topic::Telegram).count() as u64;
+                published.extend(samples);
+            }
+            telegrams
+        },
+    );
+    // What is said at the start, and what may have been said already of the silence after the end, is no telegram's.
+    let is_around = |it: &Published| it.header.hub_time_ns().is_none() && [0, SCANS].contains(&it.header.seq);
+    published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
+    published
+}
+
+/// Plays a recording step by step. Attaches subscribers before the first telegram. `take` takes what they have got, and returns the
+/// number of telegrams so far.
+pub(crate) fn step_through<T>(
+    domain: &Domain,
+    replay: &Replay<'_>,
+    attach: impl FnOnce(&Node) -> T,
+    mut take: impl FnMut(&T) -> u64,
+) {
+    let replay = Replay { play: PlaybackOptions { is_paused: true, ..replay.play }, ..replay.clone() };
     let (tell, ready) = channel();
     thread::scope(|scope| {
         let hub = scope.spawn(|| {
-            scanhub_daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+            scanhub_daemon::replay(&replay, domain, |_, player| tell.send(player.clone()).expect("waits"))
         });
         let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
-        let node = scanhub_shm::client_node(&domain).expect("a node");
-        let followers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
-        let mut published = vec![Vec::new(), Vec::new()];
-        let mut telegrams = 0;
-        let mut take = |published: &mut Vec<Vec<Published>>| {
-            let mut taken = 0;
-            for (followers, published) in followers.iter().zip(published) {
-                let samples = followers.take();
-                taken += samples.iter().filter(|sample| sample.topic == Topic::Telegram).count() as u64;
-                published.extend(samples);
-            }
-            telegrams += taken;
-            telegrams
-        };
+        let node = scanhub_shm::client_node(domain).expect("a node");
+        let subscribers = attach(&node);
         let give_up_at = Instant::now() + 3 * PATIENCE;
         while !player.progress().is_over {
             assert!(Instant::now() < give_up_at, "it does not come to an end");
-            let before = take(&mut published);
+            let before = take(&subscribers);
             player.step();
             // A step that is a silence brings no telegram: after a while it is followed by another.
             let patience = Instant::now() + Duration::from_millis(50);
-            while take(&mut published) == before && !player.progress().is_over && Instant::now() < patience {
+            while take(&subscribers) == before && !player.progress().is_over && Instant::now() < patience {
                 thread::yield_now();
             }
         }
-        take(&mut published);
+        // With the silence after the end, which a hub reports that stays for a while.
+        let until = Instant::now() + Duration::from_millis(if replay.holds { 1_500 } else { 0 });
+        while Instant::now() <= until {
+            take(&subscribers);
+            thread::sleep(Duration::from_millis(10));
+        }
+        take(&subscribers);
         player.end();
-        // What is said at the start, and what may have been said already of the silence after the end, is no telegram's.
-        let is_around =
-            |it: &Published| it.header.hub_time_ns().is_none() && [0, SCANS].contains(&it.header.seq);
-        published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
         hub.join().expect("ends").expect("ends well");
-        published
-    })
+    });
 }
 
 /// Topic, number, reasons and payload of all samples, those of a telegram together.

@@ -3,6 +3,11 @@
 
 mod client;
 mod error;
+#[cfg(feature = "read")]
+mod recording;
+#[cfg(not(feature = "read"))]
+#[path = "no_recording.rs"]
+mod recording;
 mod sample;
 mod subscription;
 mod topics;
@@ -32,6 +37,7 @@ fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
     topics::add_to(module)?;
     module.add_class::<subscription::Subscription>()?;
     module.add_class::<subscription::RobotFollower>()?;
+    module.add_class::<recording::Recording>()?;
     module.add_class::<Publication>()?;
     module.add_function(wrap_pyfunction!(sample::restore, module)?)?;
     module.add_function(wrap_pyfunction!(topic_names, module)?)?;
@@ -71,43 +77,47 @@ fn request(
     domain: Option<String>,
     root: Option<PathBuf>,
 ) -> PyResult<Option<Py<PyAny>>> {
-    /// Interval at which signals are handled.
-    const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
     check_followed(sensor).map_err(Error::from)?;
     let invalid = || Error::new("Impossible", format!("no order {order:?}"), "docs/python.md lists them");
     let verb = Verb::parse(order).ok_or_else(invalid)?;
     let (request, stop) = (Request::new(sensor, verb), Arc::new(AtomicBool::new(false)));
     let place = Place { domain, root };
-    let (send, receive) = mpsc::channel();
-    // Only the main thread handles signals, and it must not wait for the hub then.
-    thread::spawn({
+    let answer = interruptible(py, {
         let stop = Arc::clone(&stop);
         move || {
-            let answer = place.live().and_then(|domain| {
+            place.live().and_then(|domain| {
                 scanhub_client::request(&[domain], &request, &stop).map_err(Error::of_request)
-            });
-            let _ = send.send(answer);
+            })
         }
     });
-    let receive = Mutex::new(receive);
-    let answer = loop {
-        match py.detach(|| received_within(&receive, SIGNAL_INTERVAL)) {
-            Ok(answer) => break answer,
-            Err(RecvTimeoutError::Timeout) => {
-                py.check_signals().inspect_err(|_| stop.store(true, Ordering::Relaxed))?
-            }
-            Err(_) => {
-                break Err(Error::new("Failure", "the request ended without an answer", "please report it"));
-            }
-        }
-    };
+    let answer = answer.inspect_err(|_| stop.store(true, Ordering::Relaxed))?;
     let model = answer?.map(|shown| sample::Sample::of_model(sensor, &shown.model));
     model.map(|model| topics::wrap(py, model)).transpose()
 }
 
-fn received_within<T>(receive: &Mutex<mpsc::Receiver<T>>, timeout: Duration) -> Result<T, RecvTimeoutError> {
-    receive.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(timeout)
+/// Returns the result of `work`, which another thread does: only the main thread handles signals, and it must not wait
+/// for long. The thread goes on after a signal that raises an exception.
+fn interruptible<T: Send + 'static>(
+    py: Python<'_>,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> PyResult<T> {
+    let (send, receive) = mpsc::channel();
+    thread::spawn(move || send.send(work()));
+    let receive = Mutex::new(receive);
+    let wait = || receive.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(SIGNAL_INTERVAL);
+    loop {
+        match py.detach(wait) {
+            Ok(result) => return Ok(result),
+            Err(RecvTimeoutError::Timeout) => py.check_signals()?,
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(Error::new("Failure", "a thread of the package ended", "please report it").into());
+            }
+        }
+    }
 }
+
+/// Interval at which signals are handled while the package works.
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Published angles of a mount.
 #[pyclass(frozen, module = "scanhub")]

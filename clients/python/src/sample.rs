@@ -260,7 +260,17 @@ pub(crate) fn strided<'py, T>(
 
 /// Returns a numpy array with these elements.
 pub(crate) fn array<T: Element>(py: Python<'_>, elements: Vec<T>) -> PyResult<Bound<'_, PyAny>> {
-    let (address, shape) = (elements.as_ptr().expose_provenance(), vec![elements.len()]);
+    let shape = vec![elements.len()];
+    shaped(py, elements, shape)
+}
+
+/// Returns a numpy array of `shape` with these elements, the last dimension first.
+pub(crate) fn shaped<T: Element>(
+    py: Python<'_>,
+    elements: Vec<T>,
+    shape: Vec<usize>,
+) -> PyResult<Bound<'_, PyAny>> {
+    let address = elements.as_ptr().expose_provenance();
     let owner = Box::new(elements);
     Array { address, kind: T::KIND, shape, strides: None, is_view: false, _owner: owner }.into_numpy(py)
 }

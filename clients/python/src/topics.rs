@@ -10,7 +10,7 @@ use scanhub_schema::{Family, Intensities, Obstacle as FoundObstacle, Telegram as
 
 use crate::error::value;
 use crate::getters;
-use crate::sample::{Sample, array, fixed, strided, view};
+use crate::sample::{Sample, array, fixed, shaped, strided, view};
 
 /// Declares the class of each topic.
 macro_rules! classes {
@@ -220,7 +220,7 @@ getters! {
 
 /// Returns a matrix of 3 x 3.
 fn matrix<'py>(py: Python<'py>, elements: &[f32; 9]) -> PyResult<Bound<'py, PyAny>> {
-    array(py, elements.to_vec())?.call_method1("reshape", (3, 3))
+    shaped(py, elements.to_vec(), vec![3, 3])
 }
 
 getters! {

@@ -87,6 +87,19 @@ struct Parts {
 type Links<'a> = Vec<ReadLink<'a>>;
 
 impl RecordingReader {
+    /// Topics that a link publishes from telegrams. Early warnings need parts of telegrams.
+    pub const TOPICS: [Topic; 9] = [
+        Topic::Telegram,
+        Topic::Scan,
+        Topic::Marks,
+        Topic::Zones,
+        Topic::Foreground,
+        Topic::Background,
+        Topic::Status,
+        Topic::Lines,
+        Topic::Motion,
+    ];
+
     /// Opens a recording. This reads the file to its end once.
     ///
     /// # Errors
@@ -166,10 +179,10 @@ impl Iterator for RecordingReader {
 
 /// Checks that a replay publishes `topic`.
 fn check(topic: Topic) -> Result<(), Failure> {
-    if COMPUTED.contains(&topic) {
+    if RecordingReader::TOPICS.contains(&topic) {
         return Ok(());
     }
-    let names: Vec<_> = COMPUTED.iter().map(|topic| topic.name()).collect();
+    let names: Vec<_> = RecordingReader::TOPICS.iter().map(|topic| topic.name()).collect();
     let message = format!("{} is not computed from a recording", topic.name());
     Err(Failure::new(Kind::NoTopic, message, format!("the topics are {}", names.join(", "))))
 }
@@ -440,16 +453,3 @@ impl Line for Infallible {
         match *self {}
     }
 }
-
-/// Topics that a link publishes from telegrams. Early warnings need parts of telegrams.
-const COMPUTED: [Topic; 9] = [
-    Topic::Telegram,
-    Topic::Scan,
-    Topic::Marks,
-    Topic::Zones,
-    Topic::Foreground,
-    Topic::Background,
-    Topic::Status,
-    Topic::Lines,
-    Topic::Motion,
-];

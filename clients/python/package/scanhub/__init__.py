@@ -7,8 +7,8 @@
 
 `scan.ranges_m` has meters, NaN without a reading. `scan.ranges` is a read-only numpy view of the hub's memory, in device units
 and with codes. A subscription waits for a hub that does not run yet, and continues after its restart. `scanhub.robot()`
-follows the verdict of all sensors, and `scanhub.publish("mount/tilt")` publishes the angles of a mount. docs/python.md
-describes the rest.
+follows the verdict of all sensors, `scanhub.publish("mount/tilt")` publishes the angles of a mount, and
+`scanhub.read("walk.mcap")` reads a recording. docs/python.md describes the rest.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import warnings
 import weakref
-from typing import Any, Callable, Tuple, Union
+from typing import Any, Callable, Iterable, Tuple, Union
 
 from . import _scanhub
 from ._scanhub import (
@@ -31,6 +32,7 @@ from ._scanhub import (
     Motion,
     Obstacles,
     Publication,
+    Recording,
     Sample,
     Scan,
     Status,
@@ -41,7 +43,22 @@ from ._scanhub import (
     __commit__ as __commit__,
     __version__ as __version__,
 )
-from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, SilenceWarning, Silent, Taken
+from .errors import (
+    Denied,
+    Failure,
+    Held,
+    Impossible,
+    Mismatch,
+    NoHub,
+    NoTopic,
+    RecordingWarning,
+    Refused,
+    Short,
+    SilenceWarning,
+    Silent,
+    Taken,
+    Unreadable,
+)
 from .values import (
     CLASSES,
     Corner,
@@ -51,6 +68,7 @@ from .values import (
     Place,
     Pose,
     Robot,
+    Scans,
     Segment,
     Site,
     Step,
@@ -84,11 +102,14 @@ __all__ = [
     "Place",
     "Pose",
     "Publication",
+    "Recording",
+    "RecordingWarning",
     "Refused",
     "Robot",
     "RobotFollower",
     "Sample",
     "Scan",
+    "Scans",
     "Segment",
     "Short",
     "Shown",
@@ -104,11 +125,13 @@ __all__ = [
     "TopicName",
     "Track",
     "Tracks",
+    "Unreadable",
     "Zone",
     "Zones",
     "background",
     "control",
     "publish",
+    "read",
     "robot",
     "sensors",
     "subscribe",
@@ -283,6 +306,28 @@ def publish(
     Denied, Short, Mismatch or Failure.
     """
     return Publication(topic, domain, root)
+
+
+def read(
+    file: str | os.PathLike[str],
+    *,
+    topics: str | Iterable[str] = "scan",
+    sensor: str | None = None,
+    config: str | os.PathLike[str] | None = None,
+    family: str | None = None,
+) -> Recording:
+    """Reads `topics` of a recording: an MCAP file, a CARMEN log or a stream of telegrams. No hub is needed. The samples equal
+    those of `scanhub replay --rate max`, with the settings in the file `config`.
+
+    Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a recording
+    without names. `family` is that of a stream, `lms`, `ld` or `rplidar` (None: recognized by the bytes). Warns with
+    RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a wrong configuration.
+    """
+    names = (topics,) if isinstance(topics, str) else tuple(topics)
+    recording = Recording(file, names, sensor, config, family)
+    for problem in recording._problems:
+        warnings.warn(f"{os.fspath(file)}: {problem}", RecordingWarning, stacklevel=2)
+    return recording
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:

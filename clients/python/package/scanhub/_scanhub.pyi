@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self, disjoint_base
 
 from .errors import Failure
-from .values import Corner, Line, Mark, Obstacle, Place, Pose, Robot, Segment, Site, Step, Track, Zone
+from .values import Corner, Line, Mark, Obstacle, Place, Pose, Robot, Scans, Segment, Site, Step, Track, Zone
 
 __all__ = [
     "__version__",
@@ -33,6 +33,7 @@ __all__ = [
     "Obstacles",
     "Subscription",
     "RobotFollower",
+    "Recording",
     "Publication",
     "_restore",
     "_topics",
@@ -402,6 +403,27 @@ class RobotFollower:
     def _poll(self) -> Robot | None: ...
     def _descriptor(self) -> int: ...
     def _silence(self) -> Failure: ...
+
+@final
+class Recording:
+    def __new__(
+        cls,
+        file: str | PathLike[str],
+        topics: Sequence[str],
+        sensor: str | None,
+        config: str | PathLike[str] | None,
+        family: str | None,
+    ) -> Self: ...
+    def __iter__(self) -> Self: ...
+    def __next__(self) -> Any: ...
+    def to_numpy(self) -> Scans: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_error: BaseException | type[BaseException] | TracebackType | None) -> None: ...
+    @property
+    def sensors(self) -> tuple[str, ...]: ...
+    @property
+    def _problems(self) -> tuple[str, ...]: ...
 
 @final
 class Publication:

@@ -20,6 +20,14 @@ class SilenceWarning(UserWarning):
     missing, or a scanner is paused or absent."""
 
 
+class RecordingWarning(UserWarning):
+    """A recording is damaged, or does not contain what is needed to read its values. The text says what is missing."""
+
+
+class Unreadable(Failure, OSError):
+    """There is no such file, it cannot be read, or it is not a recording."""
+
+
 class NoHub(Failure):
     """No hub lives in the domain, or it went away before it answered."""
 

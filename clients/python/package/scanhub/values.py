@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class TopicName(NamedTuple):
@@ -14,6 +18,16 @@ class TopicName(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.sensor}/{self.topic}"
+
+
+class Scans(NamedTuple):
+    """Scans of a sensor, a row for each. `ranges` are meters, NaN without a reading, and after the last beam of a scan that has
+    fewer beams than another. `stamps` are ns, by the clock of `Scan.stamp_ns`. `angles` are radians: a value for each beam if they
+    are the same in all scans, otherwise a row for each scan, like `ranges`."""
+
+    ranges: NDArray[np.float64]
+    stamps: NDArray[np.int64]
+    angles: NDArray[np.float64]
 
 
 class Mark(NamedTuple):

@@ -157,7 +157,11 @@ impl<'f> FramesLap<'f> {
 
     /// Publishes that the last verdict is stale, if its validity ended before the frame at `when`. Returns `None` if
     /// the hub must end.
-    fn note_silence<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, when: When) -> Option<()> {
+    fn note_silence<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        when: When,
+    ) -> Option<()> {
         let Some(silence) = self.verdict.take_if(|verdict| when.last > verdict.until_ns) else {
             return Some(());
         };
@@ -176,7 +180,12 @@ impl<'f> FramesLap<'f> {
     }
 
     /// Forgets everything if another run of the hub recorded `frame`, because a hub knows nothing at its start.
-    fn note_run<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, frame: &Frame, when: When) {
+    fn note_run<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        frame: &Frame,
+        when: When,
+    ) {
         let run = frame.header.map(|header| header.boot);
         if !self.has_begun || self.run != run {
             if std::mem::replace(&mut self.has_begun, true) {
@@ -204,7 +213,11 @@ impl<'f> FramesLap<'f> {
     }
 
     /// Waits until the frame at `when` is due: `Some(None)` if it is skipped, `None` if the hub must end.
-    fn wait<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, when: When) -> Option<Option<Due>> {
+    fn wait<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        when: When,
+    ) -> Option<Option<Due>> {
         if when.is_skipped {
             return replay.pass().then_some(None);
         }
@@ -265,7 +278,12 @@ impl<'f> FramesLap<'f> {
     }
 
     /// Plays packets of a rotating scanner, and the revolutions that end with them. Returns `None` if the hub must end.
-    fn play_packets<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>, frame: &Frame, when: When) -> Option<()> {
+    fn play_packets<S: Platform>(
+        &mut self,
+        replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        frame: &Frame,
+        when: When,
+    ) -> Option<()> {
         let at = self.wait(replay, when)?.map(|due| {
             let recorded = RecordedMetadata { stretch: due.stretch, ..recorded(frame) };
             (self.last_stamp, recorded)

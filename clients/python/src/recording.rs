@@ -1,0 +1,271 @@
+//! Samples that the code of the hub computes from a recording, without a hub.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use bytemuck::cast_slice;
+use pyo3::prelude::*;
+use pyo3::types::PyTuple;
+use scanhub_client::{Contents, Scan, Topic};
+use scanhub_config::Sources;
+use scanhub_daemon::{ReadOptions, ReadSample, RecordingReader};
+use scanhub_schema::{Failure, Family, Kind};
+
+use crate::client::{Confined, Name};
+use crate::error::{Error, value};
+use crate::sample::{Memory, Sample, array, shaped};
+use crate::{SIGNAL_INTERVAL, interruptible, topics};
+
+/// Samples of a recording. Iterate over it.
+#[pyclass(frozen, module = "scanhub")]
+pub(crate) struct Recording {
+    reader: Confined<RecordingReader>,
+    file: PathBuf,
+    topics: Vec<Topic>,
+    sensors: Vec<String>,
+    problems: Vec<String>,
+}
+
+#[pymethods]
+impl Recording {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        file: PathBuf,
+        topics: Vec<String>,
+        sensor: Option<String>,
+        config: Option<PathBuf>,
+        family: Option<String>,
+    ) -> PyResult<Recording> {
+        let topics = topics.iter().map(|name| parse(name)).collect::<Result<Vec<_>, _>>()?;
+        if topics.is_empty() {
+            let what = format!("no topic of {} is named", file.display());
+            return Err(Error::new("NoTopic", what, "name topics, as in topics=[\"scan\"]").into());
+        }
+        let family = family.map(|name| {
+            let unknown = || Error::new("Impossible", format!("no family {name:?}"), "lms, ld or rplidar");
+            Family::parse(&name).ok_or_else(unknown)
+        });
+        let family = family.transpose()?;
+        let (place, read) = (file.clone(), topics.clone());
+        let opened = interruptible(py, move || {
+            let mut sources = Sources { files: Sources::system(), ..Sources::default() };
+            // As the program has it.
+            sources.files.extend(config.or_else(|| std::env::var_os("SCANHUB_CONFIG").map(PathBuf::from)));
+            let sensor = sensor.as_deref();
+            let options = ReadOptions { file: &place, sensor, family, sources: &sources, topics: &read };
+            RecordingReader::open(&options)
+        })?;
+        let reader = opened.map_err(refusal)?;
+        let sensors = reader.sensors().into_iter().map(str::to_owned).collect();
+        let problems = reader.problems();
+        Ok(Recording { reader: Confined::new(reader), file, topics, sensors, problems })
+    }
+
+    /// Names of the sensors that are read.
+    #[getter]
+    fn sensors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.sensors)
+    }
+
+    /// What is missing in the recording, or cannot be read.
+    #[getter]
+    fn _problems<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.problems)
+    }
+
+    fn __iter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+        let _reserved = self.reader.reserve()?;
+        let mut next = None;
+        self.read(py, |sample| {
+            next = Some(sample);
+            false
+        })?;
+        next.map(|sample| topics::wrap(py, sample_of(sample))).transpose()
+    }
+
+    /// Returns all scans that were not read yet, as arrays.
+    fn to_numpy(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
+        let _reserved = self.reader.reserve()?;
+        let place = self.file.display();
+        if self.sensors.len() > 1 {
+            let what = format!("{place} has several sensors: {}", self.sensors.join(", "));
+            let remedy = format!("read one of them: sensor={:?}", self.sensors[0]);
+            return Err(Error::new("Impossible", what, remedy).into());
+        }
+        if !self.topics.contains(&Topic::Scan) {
+            let what = format!("{place} is read without its scans");
+            return Err(Error::new("Impossible", what, "add \"scan\" to topics").into());
+        }
+        let mut scans = Scans::default();
+        self.read(py, |sample| {
+            if sample.topic == Topic::Scan {
+                scans.push(sample.header.stamp_first_ns, Scan::of_words(cast_slice(&sample.words)));
+            }
+            true
+        })?;
+        scans.into_numpy(py).map(Bound::unbind)
+    }
+
+    /// Closes the file. The iteration then ends.
+    fn close(&self) {
+        drop(self.reader.take());
+    }
+
+    fn __enter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    #[pyo3(signature = (*_error))]
+    fn __exit__(&self, _error: &Bound<'_, PyTuple>) {
+        self.close();
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<recording {}, {}>", self.file.display(), self.sensors.join(", "))
+    }
+}
+
+impl Recording {
+    /// Passes samples to `take` until it returns false, or to the end. Handles signals in between.
+    fn read(&self, py: Python<'_>, mut take: impl FnMut(ReadSample) -> bool + Send) -> PyResult<()> {
+        let mut read_for_a_while = |reader: &mut RecordingReader| {
+            let until = Instant::now() + SIGNAL_INTERVAL;
+            loop {
+                while let Some(sample) = reader.take() {
+                    if !take(sample) {
+                        return false;
+                    }
+                }
+                if !reader.step() {
+                    return false;
+                }
+                if Instant::now() >= until {
+                    return true;
+                }
+            }
+        };
+        while py.detach(|| self.reader.with(&mut read_for_a_while)) == Some(true) {
+            py.check_signals()?;
+        }
+        Ok(())
+    }
+}
+
+fn parse(name: &str) -> Result<Topic, Error> {
+    let unknown = || {
+        let names = RecordingReader::TOPICS.map(Topic::name);
+        Error::new("NoTopic", format!("no topic {name:?}"), format!("the topics are {}", names.join(", ")))
+    };
+    Topic::parse(name).ok_or_else(unknown)
+}
+
+fn sample_of(sample: ReadSample) -> Sample {
+    let ReadSample { sensor, topic, header, words, len } = sample;
+    let memory = Memory::Copy(words, len).into();
+    Sample { name: Name { sensor, topic }, header, missed: 0, restarted: false, stale: false, memory }
+}
+
+/// Returns the error for a recording that was not opened.
+fn refusal(failure: Failure) -> Error {
+    match failure.kind {
+        Kind::Input => Error::new("Unreadable", failure.message, failure.hint),
+        _ => failure.into(),
+    }
+}
+
+/// Scans as rows of arrays. Rows are as long as the longest one, and filled up with NaN.
+#[derive(Default)]
+struct Scans {
+    stamps: Vec<i64>,
+    ranges: Rows,
+    angles: Angles,
+}
+
+/// Angles of the beams, in radians.
+#[derive(Default)]
+enum Angles {
+    #[default]
+    Unknown,
+    /// Those of a beam are the same in all scans, with these values of `first_angle` and `step`.
+    Same(f64, f64, Vec<f64>),
+    PerScan(Rows),
+}
+
+impl Scans {
+    fn push(&mut self, stamp_ns: u64, scan: &Scan) {
+        let beams = scan.beams();
+        self.stamps.push(stamp_ns as i64);
+        self.ranges.push(beams, (0..beams).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)));
+        let is_exact = scan.contents & Contents::ANGLES != 0;
+        let angles = (0..beams).map(|i| scan.angle(i));
+        match &mut self.angles {
+            Angles::PerScan(rows) => rows.push(beams, angles),
+            Angles::Same(first, step, same)
+                if !is_exact && (*first, *step) == (scan.first_angle, scan.step) =>
+            {
+                same.extend(angles.skip(same.len()));
+            }
+            before => {
+                let mut rows = Rows::default();
+                if let Angles::Same(_, _, same) = &before {
+                    for _ in 1..self.stamps.len() {
+                        rows.push(same.len(), same.iter().copied());
+                    }
+                } else if !is_exact {
+                    *before = Angles::Same(scan.first_angle, scan.step, angles.collect());
+                    return;
+                }
+                rows.push(beams, angles);
+                *before = Angles::PerScan(rows);
+            }
+        }
+    }
+
+    fn into_numpy(self, py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
+        let angles = match self.angles {
+            Angles::Unknown => array(py, Vec::<f64>::new())?,
+            Angles::Same(_, _, angles) => array(py, angles)?,
+            Angles::PerScan(rows) => rows.into_numpy(py)?,
+        };
+        value(py, "Scans", (self.ranges.into_numpy(py)?, array(py, self.stamps)?, angles))
+    }
+}
+
+/// A table whose rows are as long as the longest one.
+#[derive(Default)]
+struct Rows {
+    values: Vec<f64>,
+    width: usize,
+    count: usize,
+}
+
+impl Rows {
+    fn push(&mut self, len: usize, row: impl Iterator<Item = f64>) {
+        if len > self.width {
+            self.widen(len);
+        }
+        self.values.extend(row);
+        self.count += 1;
+        self.values.resize(self.count * self.width, f64::NAN);
+    }
+
+    fn widen(&mut self, width: usize) {
+        let mut values = Vec::with_capacity((self.count + 1) * width);
+        for row in self.values.chunks(self.width.max(1)) {
+            values.extend_from_slice(row);
+            values.resize(values.len() + width - self.width, f64::NAN);
+        }
+        (self.values, self.width) = (values, width);
+    }
+
+    fn into_numpy(mut self, py: Python<'_>) -> PyResult<Bound<'_, PyAny>> {
+        self.values.shrink_to_fit();
+        let shape = vec![self.count, self.width];
+        shaped(py, self.values, shape)
+    }
+}

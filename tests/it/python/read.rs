@@ -1,0 +1,238 @@
+//! `scanhub.read` computes from a recording what a replay of it publishes, bit for bit.
+
+use std::path::Path;
+use std::process::Command;
+
+use scanhub_config::Sources;
+use scanhub_daemon::{PlaybackOptions, PlaybackRate, Replay};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::{ld, lms};
+use scanhub_schema::{
+    Background, Flags, Foreground, Header, Lines, MILLIS, Marks, Motion, Quality, Reasons, Scan, Topic, Zones,
+};
+use scanhub_shm::{Node, Payload, Subscriber};
+use scanhub_sim::device::Device;
+use scanhub_sim::ld::{LdSettings, LdSimulator};
+use scanhub_sim::room::Room;
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use super::{check, passed};
+use crate::recorded_world::recorded_world;
+use crate::replayed::recorded_rooms::{self, SENSORS};
+use crate::replayed::step_through;
+use crate::testkit::{Program, TestEnv, in_own_process};
+
+/// Settings with which backgrounds are learned within a recording, and zones are violated.
+const SETTINGS: &str =
+    "background.scans = 40\nzones.radii = [2.5, 1.5]\n[link.front]\nmode = 1\n[link.rear]\nmode = 1\n";
+
+/// Samples of all topics that do not depend on the time of the run, as `read.py` prints them.
+#[derive(Default)]
+struct Published {
+    samples: Vec<Value>,
+    telegrams: u64,
+}
+
+macro_rules! subscribers {
+    ($($name:ident: $payload:ty),*) => {
+        struct Subscribers {
+            sensor: String,
+            $($name: Subscriber<$payload>,)*
+        }
+
+        impl Subscribers {
+            fn attach(node: &Node, sensor: &str) -> Subscribers {
+                Subscribers { sensor: sensor.to_owned(), $($name: attach::<$payload>(node, sensor),)* }
+            }
+
+            fn take(&self, published: &mut Published) {
+                $(while let Some(sample) = <$payload>::receive(&self.$name).expect("works") {
+                    let bytes = <$payload>::read(&sample).bytes();
+                    published.note(&self.sensor, <$payload as Payload>::TOPIC, sample.user_header(), bytes);
+                })*
+            }
+        }
+    };
+}
+
+subscribers!(
+    telegram: [u8], scan: Scan, zones: Zones, marks: Marks, lines: Lines, motion: Motion, foreground: Foreground,
+    background: Background
+);
+
+fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
+    let service = P::open(node, sensor).expect("a topic").expect("is there");
+    P::subscriber(node, &service).expect("a place")
+}
+
+impl Published {
+    fn note(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) {
+        self.telegrams += u64::from(topic == Topic::Telegram);
+        let reasons: Vec<_> = Reasons::names(header.reasons).collect();
+        let mut flags: Vec<_> = Flags::names(header.flags & !Flags::STAMP_ESTIMATED).collect();
+        flags.sort_unstable();
+        let quality = if header.quality == Quality::Clean as u8 { "clean" } else { "suspect" };
+        let period_us = Some(header.period_us).filter(|period_us| *period_us != 0);
+        let took_ns = header.stamp_last_ns - header.stamp_first_ns;
+        let digest: String = Sha256::digest(payload).iter().map(|byte| format!("{byte:02x}")).collect();
+        let numbers = (header.seq, header.topic_seq);
+        self.samples.push(json!([
+            sensor,
+            topic.name(),
+            numbers.1,
+            numbers.0,
+            quality,
+            reasons,
+            flags,
+            period_us,
+            header.wall_ns,
+            took_ns,
+            digest
+        ]));
+    }
+}
+
+/// Samples in the order of sensor, topic and number. Those before the first telegram are left out, because a subscriber comes too
+/// late for them. Clocks of a recording without stamps are those of the run.
+fn in_order(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
+    let mut samples: Vec<Value> = samples
+        .into_iter()
+        .filter(|it| it[1] != "status" && (&it[1], &it[2]) != (&"zones".into(), &0.into()))
+        .collect();
+    if !has_stamps {
+        samples.iter_mut().for_each(|it| (it[8], it[9]) = (Value::Null, Value::Null));
+    }
+    samples.sort_by_key(|it| (it[0].to_string(), it[1].to_string(), it[2].as_u64()));
+    samples
+}
+
+/// Compares what `scanhub.read` gives of `file` with what a replay publishes, with the settings in `config`.
+fn compare(env: &TestEnv, read: Command, file: &str, config: &str, sensors: &[&str], has_stamps: bool) {
+    let sources = Sources { files: vec![config.into()], ..Sources::default() };
+    let replay = Replay {
+        file: Path::new(file),
+        sensor: None,
+        family: None,
+        sources: &sources,
+        play: PlaybackOptions { rate: PlaybackRate::Max, ..PlaybackOptions::default() },
+        holds: true,
+    };
+    let mut published = Published::default();
+    step_through(
+        &env.place(),
+        &replay,
+        |node| sensors.iter().map(|name| Subscribers::attach(node, name)).collect::<Vec<_>>(),
+        |subscribers| {
+            subscribers.iter().for_each(|it| it.take(&mut published));
+            published.telegrams
+        },
+    );
+    let mut read = read;
+    read.args(["dump", file, config]);
+    let outcome = Program::start(read).wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let [read, replayed] = [outcome.lines(), published.samples].map(|samples| in_order(samples, has_stamps));
+    for (read, replayed) in read.iter().zip(&replayed) {
+        assert_eq!(read, replayed, "{file}");
+    }
+    assert_eq!(read.len(), replayed.len(), "{file}");
+    for topic in ["telegram", "scan", "zones", "marks", "lines", "motion", "foreground", "background"] {
+        let count = replayed.iter().filter(|it| it[1] == topic).count();
+        let wanted = if topic == "background" { 2 } else { 20 };
+        assert!(count >= wanted, "{file}: {count} samples of {topic}");
+    }
+}
+
+#[test]
+fn it_equals_a_replay_bit_for_bit() {
+    in_own_process("python::read::it_equals_a_replay_bit_for_bit", || {
+        let Some(read) = check("read") else { return };
+        let env = TestEnv::new();
+        let config = env.file("robot.toml", SETTINGS);
+        let rooms = env.path("rooms.mcap");
+        recorded_rooms::record(&env.place(), &rooms, 160, Some(90), |_, _| {});
+        compare(&env, again(&read), &env.word("rooms.mcap"), &config, &SENSORS.map(|(name, _)| name), true);
+        compare(&env, again(&read), &log(&env), &config, &["front"], true);
+        compare(&env, again(&read), &stream(&env), &config, &["front"], false);
+        let config = env.file("other.toml", "background.scans = 40\n");
+        compare(&env, again(&read), &packets(&env), &config, &["front"], false);
+    });
+}
+
+#[test]
+fn arrays_and_errors() {
+    let Some(mut read) = check("read") else { return };
+    let env = TestEnv::new();
+    let world = "room".parse().expect("a world");
+    let two = recorded_world(&env, &world, &["front", "rear"], 4);
+    read.args(["check", &two, &log(&env), &packets(&env)]).arg(env.path(""));
+    passed(read);
+}
+
+#[test]
+fn the_example_plots_a_recording() {
+    let Some(mut plot) = super::super::testkit::client_python() else { return };
+    if super::python("matplotlib").is_none() {
+        return;
+    }
+    let env = TestEnv::new();
+    let file = recorded_world(&env, &"room".parse().expect("a world"), &["front"], 8);
+    let example = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python/examples/plot_recording.py");
+    plot.arg(example).args([&file, "--out", &env.word("picture.png")]);
+    passed(plot);
+    let picture = std::fs::read(env.path("picture.png")).expect("a picture");
+    assert!(picture.starts_with(b"\x89PNG"));
+}
+
+/// The same program with the same arguments.
+fn again(command: &Command) -> Command {
+    let mut again = Command::new(command.get_program());
+    again.args(command.get_args()).env_remove("SCANHUB_DOMAIN").env_remove("SCANHUB_CONFIG");
+    again
+}
+
+/// A log of a room, with a gap.
+fn log(env: &TestEnv) -> String {
+    let room = Room::new(&"demo".parse().expect("a world"), 7);
+    let line = |scan: u64| {
+        let at_ms = 1_000_000 + scan * 40 + if scan > 80 { 1_700 } else { 0 };
+        let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at_ms * MILLIS);
+        let ranges: Vec<_> =
+            look.words[..181].iter().map(|word| format!("{:.2}", f64::from(*word) / 1e3)).collect();
+        let at = at_ms as f64 / 1e3;
+        format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", ranges.join(" "))
+    };
+    env.file("a.log", (0..140).map(line).collect::<String>())
+}
+
+/// Telegrams of a room, with damaged bytes between them.
+fn stream(env: &TestEnv) -> String {
+    let room = Room::new(&"demo".parse().expect("a world"), 8);
+    let mut bytes = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
+    for scan in 0..140 {
+        let at = scan * recorded_rooms::period();
+        let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
+        let telegram = lms::measured::encode(0, Unit::Mm, &look.words, 0x10);
+        bytes.extend(telegram.bytes());
+        match scan % 30 {
+            10 => bytes.extend([0x55; 7]),
+            20 => bytes.truncate(bytes.len() - 9),
+            _ => {}
+        }
+    }
+    env.file("stream.bin", bytes)
+}
+
+/// Packets of a rotating scanner as they arrive on a line.
+fn packets(env: &TestEnv) -> String {
+    let room = Room::new(&"room".parse().expect("a world"), 7);
+    let settings = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };
+    let (mut scanner, mut bytes) = (LdSimulator::new(settings, room), Vec::new());
+    for now in (0..6_000 * MILLIS).step_by(10 * MILLIS as usize) {
+        while let Some(chunk) = scanner.poll_transmit(now) {
+            bytes.extend(chunk.bytes);
+        }
+    }
+    env.file("packets.bin", bytes)
+}
