@@ -1,13 +1,25 @@
 //! How much longer does a subscriber in another language wait than one in Rust? Measured from the last byte that the
 //! hub read to the scan in one process, which is the only subscriber; the languages alternate. Rust sleeps on the
 //! doorbell, its default, and is the baseline. The bench does not measure what a program does with the scan.
+//!
+//! How much longer does Python take to read ten minutes of two sensors from a recording into numpy arrays than the same
+//! loop in Rust? Both processes measure it without their start.
 
 mod support;
 
+use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::Path;
 use std::process::{Command, ExitCode, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use scanhub_config::Sources;
+use scanhub_daemon::{ReadOptions, RecordingReader};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_schema::file::Writer;
+use scanhub_schema::{Header, Scan, Topic};
+use scanhub_sim::room::Room;
 use support::figures::{self, Figure, Target, percentile};
 use support::stage::{Child, PATIENCE, Stage};
 use support::{Options, Outcome};
@@ -28,7 +40,14 @@ const LANGUAGES: [Language; 2] = [
 ];
 
 fn main() -> ExitCode {
-    support::main(measure)
+    support::main_with(play, measure)
+}
+
+fn play(words: &[&str]) -> Outcome<()> {
+    match *words {
+        ["read", file] => read(file.as_ref()),
+        _ => support::play(words),
+    }
 }
 
 fn measure(options: &Options) -> Outcome<()> {
@@ -61,6 +80,7 @@ fn measure(options: &Options) -> Outcome<()> {
             figures.push(Figure { name, unit: "us", hub: at(&others), baseline: at(&baselines), target });
         }
     }
+    figures.extend(reading(&stage, options)?);
     figures::print("languages", options.json, &figures);
     Ok(())
 }
@@ -72,6 +92,92 @@ fn ages(consumer: &Child, count: usize) -> Outcome<Vec<f64>> {
     let mut ages: Vec<f64> = aged.map(|line| Ok(line.number(2)? as f64 / 1e3)).collect::<Outcome<_>>()?;
     ages.sort_by(f64::total_cmp);
     Ok(ages)
+}
+
+/// Measures how long a recording takes to read.
+fn reading(stage: &Stage, options: &Options) -> Outcome<Option<Figure>> {
+    let Some(mut words) = python()? else { return Ok(None) };
+    let file = stage.file("read.mcap");
+    record(&file, options.seconds(600))?;
+    let file = file.display().to_string();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/languages/read.py");
+    words.truncate(words.len() - 1);
+    words.extend([script.display().to_string(), file.clone()]);
+    let run = |child: Child| -> Outcome<f64> {
+        let lines = child.lines_until("end", PATIENCE + Duration::from_secs(60))?;
+        let took = lines.iter().find(|line| line.text.starts_with("took")).ok_or("it did not read")?;
+        Ok(took.number(1)? as f64 / 1e6)
+    };
+    let (mut pythons, mut rusts) = (Vec::new(), Vec::new());
+    for _ in 0..options.pairs() {
+        pythons.push(run(Child::start(&words[0], &words[1..])?)?);
+        rusts.push(run(stage.part(&["read", &file])?)?);
+    }
+    let name = "Python, reading a recording into numpy";
+    Ok(Some(Figure { name, unit: "ms", hub: pythons, baseline: rusts, target: Target::Ratio(1.3) }))
+}
+
+/// Writes a recording of two sensors. The scans repeat after a while.
+fn record(file: &Path, seconds: u64) -> Outcome<()> {
+    let room = Room::new(&"room".parse()?, 1);
+    let period_ns = Variant::HALF.turns() * MIRROR_TURN;
+    let telegram = |number| {
+        let words = room.scan(Variant::HALF, Unit::Mm, Mode(1), number * period_ns);
+        lms::measured::encode(0, Unit::Mm, &words, 0x10)
+    };
+    let telegrams: Vec<_> = (0..200).map(telegram).collect();
+    let mode = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+    let mut writer = Writer::begin(File::create(file)?, "", BTreeMap::new())?;
+    for seq in 0..seconds * 1_000_000_000 / period_ns {
+        for (number, sensor) in RECORDED.iter().enumerate() {
+            let end_ns = 1_000_000_000 + seq * period_ns + number as u64 * 9_000_000;
+            let mut header = Header {
+                seq,
+                topic_seq: seq,
+                stamp_first_ns: end_ns - 14_640_000,
+                stamp_last_ns: end_ns,
+                wall_ns: 1_700_000_000_000_000_000 + end_ns,
+                boot: 7,
+                sensor: number as u8,
+                period_us: (period_ns / 1000) as u32,
+                ..Header::default()
+            };
+            header.set_sent_at(end_ns + 100_000);
+            let telegram = if seq == 0 { &mode } else { &telegrams[seq as usize % telegrams.len()] };
+            writer.sample(sensor, Topic::Telegram, &header, telegram.bytes())?;
+        }
+        if seq % 40 == 0 {
+            writer.close_chunk()?;
+        }
+    }
+    writer.finish()?;
+    Ok(())
+}
+
+/// Reads the scans of a recording into arrays, and prints how long that took.
+fn read(file: &Path) -> Outcome<()> {
+    let begin = Instant::now();
+    let mut beams = 0;
+    for sensor in RECORDED {
+        let sources = Sources::default();
+        let options = ReadOptions {
+            file,
+            sensor: Some(sensor),
+            family: None,
+            sources: &sources,
+            topics: &[Topic::Scan],
+        };
+        let (mut ranges, mut stamps) = (Vec::new(), Vec::new());
+        for sample in RecordingReader::open(&options)? {
+            let scan = Scan::of_words(bytemuck::cast_slice(&sample.words));
+            ranges.extend((0..scan.beams()).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)));
+            stamps.push(sample.header.stamp_first_ns as i64);
+        }
+        beams += ranges.len();
+    }
+    println!("took {} {beams}", begin.elapsed().as_nanos());
+    println!("end");
+    Ok(())
 }
 
 fn python() -> Outcome<Option<Vec<String>>> {
@@ -115,5 +221,7 @@ fn c() -> Outcome<Option<Vec<String>>> {
 }
 
 const SENSOR: &str = "front";
+/// Sensors in the recording.
+const RECORDED: [&str; 2] = ["front", "rear"];
 /// Scans at the start of a run that do not count.
 const SETTLING: usize = 40;

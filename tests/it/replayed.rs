@@ -67,8 +67,11 @@ pub(crate) fn step_through<T>(
     let replay = Replay { play: PlaybackOptions { is_paused: true, ..replay.play }, ..replay.clone() };
     let (tell, ready) = channel();
     thread::scope(|scope| {
-        let hub = scope.spawn(|| {
-            scanhub_daemon::replay(&replay, domain, |_, player| tell.send(player.clone()).expect("waits"))
+        let replay = &replay;
+        let hub = scope.spawn(move || {
+            let told =
+                scanhub_daemon::replay(replay, domain, |_, player| tell.send(player.clone()).expect("waits"));
+            told.inspect_err(|failure| eprintln!("{failure}"))
         });
         let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
         let node = scanhub_shm::client_node(domain).expect("a node");
@@ -85,7 +88,7 @@ pub(crate) fn step_through<T>(
             }
         }
         // With the silence after the end, which a hub reports that stays for a while.
-        let until = Instant::now() + Duration::from_millis(if replay.holds { 1_500 } else { 0 });
+        let until = Instant::now() + Duration::from_millis(if replay.holds { 1_000 } else { 0 });
         while Instant::now() <= until {
             take(&subscribers);
             thread::sleep(Duration::from_millis(10));

@@ -6,7 +6,7 @@ use std::fmt::Display;
 use std::io::Write;
 
 /// What tests can do without, by its name in `SCANHUB_REQUIRE`.
-const NEEDS: [&str; 25] = [
+const NEEDS: [&str; 26] = [
     "bash",
     "cc",
     "c++",
@@ -17,6 +17,8 @@ const NEEDS: [&str; 25] = [
     "python",
     // What the pages and other people's readers of recordings import.
     "python-packages",
+    // Draws the picture of an example.
+    "matplotlib",
     // The vendor's driver of the RPLIDARs, of which there is no build for every Python.
     "rplidar-driver",
     "setsid",

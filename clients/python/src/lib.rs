@@ -96,7 +96,7 @@ fn request(
 }
 
 /// Returns the result of `work`, which another thread does: only the main thread handles signals, and it must not wait
-/// for long. The thread goes on after a signal that raises an exception.
+/// for long. The thread continues after a signal that raises an exception.
 fn interruptible<T: Send + 'static>(
     py: Python<'_>,
     work: impl FnOnce() -> T + Send + 'static,

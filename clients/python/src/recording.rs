@@ -68,7 +68,7 @@ impl Recording {
         PyTuple::new(py, &self.sensors)
     }
 
-    /// What is missing in the recording, or cannot be read.
+    /// Messages about damage, and about values that cannot be read.
     #[getter]
     fn _problems<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
         PyTuple::new(py, &self.problems)
@@ -191,7 +191,7 @@ struct Scans {
 enum Angles {
     #[default]
     Unknown,
-    /// Those of a beam are the same in all scans, with these values of `first_angle` and `step`.
+    /// A row for all scans, which have these values of `first_angle` and `step`.
     Same(f64, f64, Vec<f64>),
     PerScan(Rows),
 }

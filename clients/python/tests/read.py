@@ -102,7 +102,7 @@ def what_cannot_be_read() -> None:
     refusal(scanhub.Impossible, '"lsm"', "lms, ld or rplidar", file=log, family="lsm")
     refusal(scanhub.Failure, "no.toml", "No such file", file=log, config=os.path.join(place, "no.toml"))
     wrong = write("wrong.toml", b"zones.radius = [1]\n")
-    refusal(scanhub.Impossible, wrong, "zones.radi", file=log, config=wrong)
+    refusal(scanhub.Impossible, wrong, "`radius`", "radii", file=log, config=wrong)
     other = write("other.toml", b'[[link]]\nname = "front"\nport = "/dev/x"\nfamily = "ld"\n')
     refusal(scanhub.Impossible, "family lms", "family ld", file=two, config=other)
 
@@ -137,7 +137,6 @@ def one_thread_at_a_time_and_no_child() -> None:
 
 
 def control_c_ends_it() -> None:
-    # A FIFO would wait forever; a long recording only takes a while.
     long = write("long.log", b"".join(open(log, "rb").read() for _ in range(60)))
     recording = scanhub.read(long, topics=["scan", "lines", "motion", "foreground"])
     sent = []

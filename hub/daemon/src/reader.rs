@@ -77,7 +77,7 @@ self_cell!(
     }
 );
 
-/// What links borrow.
+/// Values that the links borrow.
 struct Parts {
     config: Config,
     recorded: Vec<Recorded>,
@@ -221,7 +221,7 @@ impl ReadLink<'_> {
     /// Returns the media time of the next step; `None` at the end.
     fn next_media(&self) -> Option<Nanos> {
         match &self.phase {
-            // A lap that is over is ended by a step at once.
+            // At its end, the next step ends the lap.
             Phase::Playing(lap) => Some(lap.next_media().unwrap_or(0)),
             Phase::Expiring(media) => Some(*media),
             Phase::Over => None,

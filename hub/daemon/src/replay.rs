@@ -176,7 +176,7 @@ impl<'f> Lap<'f> {
         })
     }
 
-    /// Returns the media time of what [`step`](Self::step) plays next; `None` at the end.
+    /// Returns the media time of the next [`step`](Self::step); `None` at the end.
     pub(crate) fn next_media(&self) -> Option<Nanos> {
         match self {
             Lap::Bytes(lap) => lap.next_media(),

@@ -18,14 +18,21 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{check, passed};
+use crate::pages::text_on;
 use crate::recorded_world::recorded_world;
 use crate::replayed::recorded_rooms::{self, SENSORS};
 use crate::replayed::step_through;
-use crate::testkit::{Program, TestEnv, in_own_process};
+use crate::testkit::{Program, TestEnv, client_python, in_own_process, python_for};
 
 /// Settings with which backgrounds are learned within a recording, and zones are violated.
-const SETTINGS: &str =
-    "background.scans = 40\nzones.radii = [2.5, 1.5]\n[link.front]\nmode = 1\n[link.rear]\nmode = 1\n";
+const SETTINGS: &str = r#"
+background.scans = 40
+zones.radii = [2.5, 1.5]
+[[link]]
+name = "rear"
+port = "/dev/ttyUSB0"
+zones.radii = [3.0, 2.0]
+"#;
 
 /// Samples of all topics that do not depend on the time of the run, as `read.py` prints them.
 #[derive(Default)]
@@ -47,8 +54,8 @@ macro_rules! subscribers {
             }
 
             fn take(&self, published: &mut Published) {
-                $(while let Some(sample) = <$payload>::receive(&self.$name).expect("works") {
-                    let bytes = <$payload>::read(&sample).bytes();
+                $(while let Some(sample) = <$payload as Payload>::receive(&self.$name).expect("works") {
+                    let bytes = Payload::bytes(<$payload as Payload>::read(&sample));
                     published.note(&self.sensor, <$payload as Payload>::TOPIC, sample.user_header(), bytes);
                 })*
             }
@@ -107,7 +114,7 @@ fn in_order(samples: Vec<Value>, has_stamps: bool) -> Vec<Value> {
     samples
 }
 
-/// Compares what `scanhub.read` gives of `file` with what a replay publishes, with the settings in `config`.
+/// Compares the samples that `scanhub.read` returns with those that a replay publishes, with the settings in `config`.
 fn compare(env: &TestEnv, read: Command, file: &str, config: &str, sensors: &[&str], has_stamps: bool) {
     let sources = Sources { files: vec![config.into()], ..Sources::default() };
     let replay = Replay {
@@ -151,7 +158,7 @@ fn it_equals_a_replay_bit_for_bit() {
         let env = TestEnv::new();
         let config = env.file("robot.toml", SETTINGS);
         let rooms = env.path("rooms.mcap");
-        recorded_rooms::record(&env.place(), &rooms, 160, Some(90), |_, _| {});
+        recorded_rooms::record(&env.place(), &rooms, 110, Some(70), |_, _| {});
         compare(&env, again(&read), &env.word("rooms.mcap"), &config, &SENSORS.map(|(name, _)| name), true);
         compare(&env, again(&read), &log(&env), &config, &["front"], true);
         compare(&env, again(&read), &stream(&env), &config, &["front"], false);
@@ -171,9 +178,24 @@ fn arrays_and_errors() {
 }
 
 #[test]
+fn the_program_on_the_page_runs() {
+    let Some(mut program) = client_python() else { return };
+    let env = TestEnv::new();
+    let file = recorded_world(&env, &"room".parse().expect("a world"), &["front", "rear"], 4);
+    std::fs::rename(file, env.path("walk.mcap")).expect("a file");
+    env.file("robot.toml", SETTINGS);
+    let text = text_on("docs/python.md", "python,no_run", "import scanhub");
+    program.args(["-c", &text]).current_dir(env.path(""));
+    let outcome = Program::start(program).wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let words = String::from_utf8_lossy(&outcome.out).into_owned();
+    assert!(words.contains("front 5 ") && words.trim_end().ends_with(" s"), "{words}");
+}
+
+#[test]
 fn the_example_plots_a_recording() {
-    let Some(mut plot) = super::super::testkit::client_python() else { return };
-    if super::python("matplotlib").is_none() {
+    let Some(mut plot) = client_python() else { return };
+    if python_for("matplotlib", "matplotlib").is_none() {
         return;
     }
     let env = TestEnv::new();
@@ -185,7 +207,7 @@ fn the_example_plots_a_recording() {
     assert!(picture.starts_with(b"\x89PNG"));
 }
 
-/// The same program with the same arguments.
+/// Returns the same program with the same arguments.
 fn again(command: &Command) -> Command {
     let mut again = Command::new(command.get_program());
     again.args(command.get_args()).env_remove("SCANHUB_DOMAIN").env_remove("SCANHUB_CONFIG");
@@ -203,14 +225,14 @@ fn log(env: &TestEnv) -> String {
         let at = at_ms as f64 / 1e3;
         format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", ranges.join(" "))
     };
-    env.file("a.log", (0..140).map(line).collect::<String>())
+    env.file("a.log", (0..110).map(line).collect::<String>())
 }
 
 /// Telegrams of a room, with damaged bytes between them.
 fn stream(env: &TestEnv) -> String {
     let room = Room::new(&"demo".parse().expect("a world"), 8);
     let mut bytes = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10).bytes().to_vec();
-    for scan in 0..140 {
+    for scan in 0..110 {
         let at = scan * recorded_rooms::period();
         let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
         let telegram = lms::measured::encode(0, Unit::Mm, &look.words, 0x10);

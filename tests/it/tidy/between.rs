@@ -278,6 +278,7 @@ fn the_libraries_for_c_and_python_know_clients() {
         vec![
             tree.with_line(python, "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line(python, "[dependencies]", "iceoryx2.workspace = true"),
+            tree.with_line(python, "[features]", "default = [\"read\"]"),
             tree.with_line("clients/verbs/Cargo.toml", "[dependencies]", "scanhub-python.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
@@ -305,11 +306,13 @@ fn the_daemon_knows_neither_clients_nor_sim() {
 #[test]
 fn only_the_program_sees_all() {
     holds(crates::only_the_program_sees_all, |tree| {
+        let python = "clients/python/Cargo.toml";
         vec![
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-daemon.workspace = true"),
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-client.workspace = true"),
             tree.with_line("hub/sim/Cargo.toml", "[dependencies]", "scanhub-network.workspace = true"),
             tree.with_line("Cargo.toml", "[dependencies]", "scanhub-world.workspace = true"),
+            tree.with(python, &tree.text(python).replace(", optional = true", "")),
         ]
     });
 }

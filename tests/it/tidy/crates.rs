@@ -472,9 +472,33 @@ fn built_of(tree: &Tree, package: &str, known: &[&str]) -> Vec<String> {
     others.map(|name| format!("{package} is built with {name}")).collect()
 }
 
+/// Removes the crates of the hub that the Python package is built with for its feature `read` alone, which computes what a replay
+/// publishes. They stay if they are not optional, or if another feature names them.
+fn leave_out_read(manifest: &mut toml::Table) {
+    const OF_READ: [&str; 3] = ["scanhub-config", "scanhub-daemon", "scanhub-recording"];
+    let features = manifest.get("features").and_then(toml::Value::as_table).cloned().unwrap_or_default();
+    let names = |feature: &toml::Value, name: &str| {
+        feature.as_array().into_iter().flatten().any(|word| word.as_str() == Some(name))
+    };
+    let dependencies = manifest.get_mut("dependencies").and_then(toml::Value::as_table_mut);
+    let dependencies = dependencies.expect("a crate has dependencies");
+    for name in OF_READ {
+        let is_optional = dependencies.get(name).and_then(|it| it.get("optional")) == Some(&true.into());
+        let with = format!("dep:{name}");
+        let of_read_alone = features.iter().all(|(feature, words)| match &feature[..] {
+            "read" => names(words, &with),
+            _ => !names(words, &with) && !names(words, "read"),
+        });
+        if is_optional && of_read_alone {
+            dependencies.remove(name);
+        }
+    }
+}
+
 /// Finds what the libraries for C and for Python use besides the client library, and crates that are built with them.
 pub(crate) fn the_libraries_for_c_and_python_know_clients(tree: &Tree) -> Vec<String> {
-    let members = tree.members();
+    let mut members = tree.members();
+    members.entry("scanhub-python".to_owned()).and_modify(leave_out_read);
     let mut breaches = Vec::new();
     for (own, others) in [("scanhub-c", &[][..]), ("scanhub-python", &["bytemuck", "pyo3"])] {
         let known = [&["scanhub-client", "scanhub-schema"], others].concat();
@@ -520,11 +544,14 @@ pub(crate) fn only_the_program_sees_all(tree: &Tree) -> Vec<String> {
         &["scanhub-tools"],
     ];
     let mut breaches = Vec::new();
-    for (name, manifest) in tree.members() {
-        let mut known = ours(&manifest, &NORMAL);
+    for (name, mut manifest) in tree.members() {
         if name == WORLD {
             continue;
         }
+        if name == "scanhub-python" {
+            leave_out_read(&mut manifest);
+        }
+        let mut known = ours(&manifest, &NORMAL);
         known.insert(name.clone());
         let met = ends.iter().filter(|end| end.iter().any(|name| known.contains(*name))).count();
         if met > 1 {

@@ -21,7 +21,7 @@ class SilenceWarning(UserWarning):
 
 
 class RecordingWarning(UserWarning):
-    """A recording is damaged, or does not contain what is needed to read its values. The text says what is missing."""
+    """A recording is damaged, or does not contain what is needed to read its values. The text names the missing part."""
 
 
 class Unreadable(Failure, OSError):

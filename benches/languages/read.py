@@ -1,0 +1,14 @@
+"""Reads the scans of a recording into arrays, and prints how long that took: `took NS BEAMS`. The argument is the file."""
+
+import sys
+import time
+
+import scanhub
+
+begin = time.monotonic_ns()
+beams = 0
+for sensor in ("front", "rear"):
+    ranges, stamps, angles = scanhub.read(sys.argv[1], sensor=sensor).to_numpy()
+    beams += ranges.size
+print(f"took {time.monotonic_ns() - begin} {beams}")
+print("end")
