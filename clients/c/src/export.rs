@@ -184,7 +184,7 @@ pub extern "C" fn scanhub_why_silent(handle: *mut Opaque, text: *mut *const c_ch
             text.write(c"".as_ptr());
         }
         with(handle, |handle: &mut Handle| {
-            let (reason, message) = handle.why_silent()?;
+            let (reason, message) = handle.why_silent();
             if let Some(text) = text {
                 text.write(message.as_ptr());
             }

@@ -16,8 +16,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use scanhub_client::{
-    Error, Heard, Payload, Pollable, Publication, Received, Robot, RobotSubscriber, Silence, Subscriber,
-    SubscriberBuilder, Wait, ZonesSubscriber, publish_domain,
+    Error, Heard, Payload, PollableSubscriber, Publication, Received, Robot, RobotSubscriber, Silence,
+    Subscribe, Subscriber, SubscriberBuilder, Wait, publish_domain,
 };
 use scanhub_schema::{Failure, Header, Kind, Tilt, Topic, limits};
 
@@ -38,24 +38,36 @@ pub(crate) struct Handle {
 /// Maximum number of samples that are lent at a time: as many as a subscriber can borrow from the hub.
 const LENT: usize = limits::BORROWED;
 
-/// Type that follows a topic: zones expire, other samples do not.
-macro_rules! follower {
+/// Kind of the subscriber of a topic: zones expire, other samples do not.
+macro_rules! kind {
     (Zones $payload:tt) => {
-        ZonesSubscriber
+        Heard
     };
     ($topic:ident $payload:tt) => {
-        Subscriber<scanhub_schema::payload_type!($payload)>
+        scanhub_schema::payload_type!($payload)
     };
 }
 
-/// Subscriber `T` that waits as the program has chosen. Only one that waits by event has a descriptor.
-enum Port<T> {
-    Sleeping(T),
-    Pollable(Pollable<T>),
+/// Subscriber that waits as the program has chosen. Only one that waits by event has a descriptor.
+enum Port<T: Subscribe + ?Sized> {
+    Sleeping(Subscriber<T>),
+    Pollable(PollableSubscriber<T>),
 }
 
-impl<T> Port<T> {
-    fn subscriber_mut(&mut self) -> &mut T {
+impl<T: Subscribe + ?Sized> Port<T> {
+    /// Opens the subscriber in `domain`, or in the domain that the environment names.
+    fn open(builder: SubscriberBuilder<T>, domain: Option<&str>, wait: Wait) -> Result<Port<T>, Error> {
+        let builder = match domain {
+            Some(domain) => builder.domain(domain),
+            None => builder,
+        };
+        Ok(match wait {
+            Wait::Event => Port::Pollable(builder.open_pollable()?),
+            _ => Port::Sleeping(builder.wait(wait).open()?),
+        })
+    }
+
+    fn subscriber_mut(&mut self) -> &mut Subscriber<T> {
         match self {
             Port::Sleeping(subscriber) => subscriber,
             Port::Pollable(pollable) => pollable.subscriber_mut(),
@@ -73,40 +85,26 @@ impl<T> Port<T> {
     }
 }
 
-/// Type of a sample of a topic.
-macro_rules! sample {
-    (Zones $payload:tt) => {
-        Heard
-    };
-    ($topic:ident $payload:tt) => {
-        Received<scanhub_schema::payload_type!($payload)>
-    };
-}
-
 /// Declares the sources and samples from the table of topics. A robot combines the zones of its sensors.
 macro_rules! topics {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        enum Source { Robot(Port<RobotSubscriber>), $($topic(Port<follower!($topic $payload)>),)* }
+        enum Source { Robot(Port<Robot>), $($topic(Port<kind!($topic $payload)>),)* }
 
-        enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }
+        enum Held { Robot(Told), $($topic(<kind!($topic $payload) as Subscribe>::Item),)* }
 
         impl Source {
             fn open(domain: Option<&str>, sensor: &str, topic: Topic, wait: Wait) -> Result<Source, Error> {
                 Ok(match topic {
                     $(Topic::$topic => {
-                        let builder = <follower!($topic $payload)>::builder(sensor).wait(wait);
-                        let builder = in_domain(builder, domain);
-                        Source::$topic(match wait {
-                            Wait::Event => Port::Pollable(builder.open_pollable()?),
-                            _ => Port::Sleeping(builder.open()?),
-                        })
+                        let builder = Subscriber::<kind!($topic $payload)>::builder(sensor);
+                        Source::$topic(Port::open(builder, domain, wait)?)
                     })*
                 })
             }
 
             fn try_next(&mut self) -> Result<Option<Held>, Error> {
                 Ok(match self {
-                    Source::Robot(robot) => robot.subscriber_mut().try_next()?.map(Told::new).map(Held::Robot),
+                    Source::Robot(robot) => robot.subscriber_mut().try_next()?.map(|robot| Held::Robot(Told::new(&robot))),
                     $(Source::$topic(topic) => topic.subscriber_mut().try_next()?.map(Held::$topic),)*
                 })
             }
@@ -139,11 +137,10 @@ macro_rules! topics {
                 }
             }
 
-            /// Returns `None` for a robot: each of its sensors has its own reason.
-            fn why_silent(&mut self) -> Option<Silence> {
+            fn why_silent(&mut self) -> Silence {
                 match self {
-                    Source::Robot(_) => None,
-                    $(Source::$topic(topic) => Some(topic.subscriber_mut().why_silent()),)*
+                    Source::Robot(robot) => robot.subscriber_mut().why_silent(),
+                    $(Source::$topic(topic) => topic.subscriber_mut().why_silent(),)*
                 }
             }
         }
@@ -204,12 +201,9 @@ impl Handle {
         wait: Wait,
         early: bool,
     ) -> Result<Handle, CallError> {
-        let robot = in_domain(RobotSubscriber::builder(sensors).wait(wait), domain);
+        let robot = RobotSubscriber::builder(sensors);
         let robot = if early { robot.early() } else { robot };
-        Ok(Handle::of(Source::Robot(match wait {
-            Wait::Event => Port::Pollable(robot.open_pollable()?),
-            _ => Port::Sleeping(robot.open()?),
-        })))
+        Ok(Handle::of(Source::Robot(Port::open(robot, domain, wait)?)))
     }
 
     fn of(source: Source) -> Handle {
@@ -267,7 +261,7 @@ impl Handle {
         Ok(())
     }
 
-    /// Returns the descriptor of a handle that waits by event, as [`Pollable`] has it.
+    /// Returns the descriptor of a handle that waits by event, as [`PollableSubscriber`] has it.
     pub(crate) fn descriptor(&self) -> Result<c_int, CallError> {
         Ok(self.source.descriptor()?)
     }
@@ -283,23 +277,12 @@ impl Handle {
     }
 
     /// Returns why no sample arrives, as [`Subscriber::why_silent`] does: SCANHUB_SILENCE_.. of the header, and the text,
-    /// which lives until the next call. Fails for a robot.
-    pub(crate) fn why_silent(&mut self) -> Result<(c_int, &CStr), CallError> {
-        let silence = self.source.why_silent().ok_or_else(|| {
-            let hint = "scanhub_open each of its sensors, and use those handles";
-            Error::from(Failure::new(Kind::Configuration, "a robot has no single reason for a silence", hint))
-        })?;
+    /// which lives until the next call.
+    pub(crate) fn why_silent(&mut self) -> (c_int, &CStr) {
+        let silence = self.source.why_silent();
         // Messages are printable, so they contain no 0.
         self.silence = CString::new(silence_text(&silence)).unwrap_or_default();
-        Ok((silence_number(&silence), &self.silence))
-    }
-}
-
-/// Sets the domain, if the program names one.
-fn in_domain<T>(builder: SubscriberBuilder<T>, domain: Option<&str>) -> SubscriberBuilder<T> {
-    match domain {
-        Some(domain) => builder.domain(domain),
-        None => builder,
+        (silence_number(&silence), &self.silence)
     }
 }
 

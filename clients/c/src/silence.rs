@@ -2,7 +2,7 @@
 
 use std::ffi::c_int;
 
-use scanhub_client::{DEFAULT_DOMAIN, Domain, Environment, Error, Silence, live_sensors, live_topics};
+use scanhub_client::{Silence, domain_candidates, live_sensors, live_topics};
 
 use crate::boundary::CallError;
 
@@ -29,18 +29,12 @@ pub(crate) fn silence_text(silence: &Silence) -> String {
 
 /// Returns the names of the sensors in `domain`, or in the domain that the environment names, sorted.
 pub(crate) fn sensors(domain: Option<&str>) -> Result<Vec<String>, CallError> {
-    let mut sensors = live_sensors(&places(domain)?);
+    let mut sensors = live_sensors(&domain_candidates(domain, None)?);
     sensors.sort();
     Ok(sensors)
 }
 
 /// Returns the topics of all sensors in `domain`, as [`sensors`] does.
 pub(crate) fn topics(domain: Option<&str>) -> Result<Vec<String>, CallError> {
-    Ok(live_topics(&places(domain)?))
-}
-
-fn places(domain: Option<&str>) -> Result<Vec<Domain>, CallError> {
-    let from_environment = || std::env::var("SCANHUB_DOMAIN").unwrap_or_else(|_| DEFAULT_DOMAIN.to_owned());
-    let name = domain.map_or_else(from_environment, str::to_owned);
-    Ok(Domain::candidates(&name, None, &Environment::of_process()).map_err(Error::from)?)
+    Ok(live_topics(&domain_candidates(domain, None)?))
 }

@@ -5,19 +5,16 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use scanhub_schema::check_followed;
-use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment, Payload};
+use scanhub_shm::{DEFAULT_DOMAIN, Domain, Environment};
 
 use crate::error::Error;
-use crate::joined::JoinedSubscriber;
-use crate::pollable::{Pollable, PollableSubscriber};
-use crate::robot::{RobotSource, RobotSubscriber};
+use crate::pollable::PollableSubscriber;
+use crate::robot::Robot;
 use crate::session::Session;
-use crate::subscribe::Subscriber;
+use crate::subscribe::{Subscribe, Subscriber, WithTimeout};
 use crate::wait::Wait;
-use crate::zones::ZonesSubscriber;
 
-/// Options of a subscriber of type `T`: a [`Subscriber`], [`JoinedSubscriber`], [`ZonesSubscriber`] or
-/// [`RobotSubscriber`].
+/// Options of a [`Subscriber<T>`](Subscriber).
 ///
 /// # Examples
 ///
@@ -39,26 +36,26 @@ use crate::zones::ZonesSubscriber;
 /// ```
 #[derive(Clone, Debug)]
 #[must_use = "a builder does nothing until it is opened"]
-pub struct SubscriberBuilder<T> {
+pub struct SubscriberBuilder<T: ?Sized> {
     sensors: Vec<String>,
     domain: Option<String>,
     root: Option<PathBuf>,
     wait: Wait,
     timeout: Option<Duration>,
     early: bool,
-    subscriber: PhantomData<fn() -> T>,
+    kind: PhantomData<fn(&T)>,
 }
 
-impl<T> SubscriberBuilder<T> {
-    pub(crate) fn new(sensors: &[&str]) -> SubscriberBuilder<T> {
+impl<T: Subscribe + ?Sized> SubscriberBuilder<T> {
+    pub(crate) fn new(sensors: Vec<String>) -> SubscriberBuilder<T> {
         SubscriberBuilder {
-            sensors: sensors.iter().map(|&sensor| sensor.to_owned()).collect(),
+            sensors,
             domain: None,
             root: None,
             wait: Wait::default(),
             timeout: None,
             early: false,
-            subscriber: PhantomData,
+            kind: PhantomData,
         }
     }
 
@@ -83,143 +80,74 @@ impl<T> SubscriberBuilder<T> {
         SubscriberBuilder { wait, ..self }
     }
 
+    /// Creates the subscriber. The hub may start later.
+    ///
+    /// # Errors
+    ///
+    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of a sensor or of the domain is invalid.
+    pub fn open(self) -> Result<Subscriber<T>, Error> {
+        Ok(Subscriber::new(self.session()?, T::source(&self), self.timeout))
+    }
+
+    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
+    /// [`wait`](Self::wait) says.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
+    /// descriptors have run out.
+    pub fn open_pollable(self) -> Result<PollableSubscriber<T>, Error> {
+        let mut session = self.session()?;
+        let descriptor = session.pollable()?;
+        Ok(PollableSubscriber::new(descriptor, Subscriber::new(session, T::source(&self), self.timeout)))
+    }
+
     /// Checks the names of the sensors, and returns the session.
     fn session(&self) -> Result<Session, Error> {
         self.sensors.iter().try_for_each(|sensor| check_followed(sensor))?;
-        let from_environment;
-        let name = match &self.domain {
-            Some(name) => name,
-            None => {
-                from_environment = domain_of_process();
-                &from_environment
-            }
-        };
-        let places = Domain::candidates(name, self.root.as_deref(), &Environment::of_process())?;
+        let places = domain_candidates(self.domain.as_deref(), self.root.as_deref())?;
         Ok(Session::new(places).by(self.wait))
     }
 
     /// Returns the first sensor; the builder of a single sensor has one.
-    fn sensor(&self) -> &str {
+    pub(crate) fn sensor(&self) -> &str {
         self.sensors.first().map_or("", String::as_str)
+    }
+
+    /// Returns the names of the sensors.
+    pub(crate) fn sensors(&self) -> Vec<&str> {
+        self.sensors.iter().map(String::as_str).collect()
     }
 }
 
-impl<P: Payload + ?Sized> SubscriberBuilder<Subscriber<P>> {
+impl<T: WithTimeout + ?Sized> SubscriberBuilder<T> {
     /// Lets [`Subscriber::next`] return `None` after a silence of `timeout`. Default: it waits forever.
     pub fn timeout(self, timeout: Duration) -> Self {
         SubscriberBuilder { timeout: Some(timeout), ..self }
     }
-
-    /// Creates the subscriber. The hub may start later.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of the sensor or of the domain is invalid.
-    pub fn open(self) -> Result<Subscriber<P>, Error> {
-        Ok(Subscriber::new(self.session()?, self.sensor(), self.timeout))
-    }
-
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
-    /// [`wait`](Self::wait) says.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
-    /// descriptors have run out.
-    pub fn open_pollable(self) -> Result<PollableSubscriber<P>, Error> {
-        let mut session = self.session()?;
-        let descriptor = session.pollable()?;
-        Ok(Pollable::new(descriptor, Subscriber::new(session, self.sensor(), self.timeout)))
-    }
 }
 
-impl<A: Payload + ?Sized, B: Payload + ?Sized> SubscriberBuilder<JoinedSubscriber<A, B>> {
-    /// Lets [`JoinedSubscriber::next`] return `None` after a silence of `timeout`. Default: it waits forever.
-    pub fn timeout(self, timeout: Duration) -> Self {
-        SubscriberBuilder { timeout: Some(timeout), ..self }
-    }
-
-    /// Creates the subscriber. The hub may start later.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of the sensor or of the domain is invalid.
-    pub fn open(self) -> Result<JoinedSubscriber<A, B>, Error> {
-        Ok(JoinedSubscriber::new(self.session()?, self.sensor(), self.timeout))
-    }
-
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
-    /// [`wait`](Self::wait) says.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
-    /// descriptors have run out.
-    pub fn open_pollable(self) -> Result<Pollable<JoinedSubscriber<A, B>>, Error> {
-        let mut session = self.session()?;
-        let descriptor = session.pollable()?;
-        Ok(Pollable::new(descriptor, JoinedSubscriber::new(session, self.sensor(), self.timeout)))
-    }
-}
-
-impl SubscriberBuilder<ZonesSubscriber> {
-    /// Creates the subscriber. The hub may start later.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of the sensor or of the domain is invalid.
-    pub fn open(self) -> Result<ZonesSubscriber, Error> {
-        Ok(ZonesSubscriber::new(self.session()?, self.sensor()))
-    }
-
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
-    /// [`wait`](Self::wait) says.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
-    /// descriptors have run out.
-    pub fn open_pollable(self) -> Result<Pollable<ZonesSubscriber>, Error> {
-        let mut session = self.session()?;
-        let descriptor = session.pollable()?;
-        Ok(Pollable::new(descriptor, ZonesSubscriber::new(session, self.sensor())))
-    }
-}
-
-impl SubscriberBuilder<RobotSubscriber> {
+impl SubscriberBuilder<Robot> {
     /// Takes early warnings too ([`Early`](crate::Early)): the verdict becomes worse before a scan is complete, and the
     /// hub withdraws the warning if the scan does not confirm it.
     pub fn early(self) -> Self {
         SubscriberBuilder { early: true, ..self }
     }
 
-    /// Creates the subscriber. The hub may start later.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name of a sensor or of the domain is invalid.
-    pub fn open(self) -> Result<RobotSubscriber, Error> {
-        Ok(RobotSubscriber::new(self.session()?, self.robot()))
+    pub(crate) fn is_early(&self) -> bool {
+        self.early
     }
+}
 
-    /// Creates the subscriber with a descriptor for `poll`, `epoll` or an executor. It waits by event, whatever
-    /// [`wait`](Self::wait) says.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`open`](Self::open), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if
-    /// descriptors have run out.
-    pub fn open_pollable(self) -> Result<Pollable<RobotSubscriber>, Error> {
-        let mut session = self.session()?;
-        let descriptor = session.pollable()?;
-        Ok(Pollable::new(descriptor, RobotSubscriber::new(session, self.robot())))
-    }
-
-    fn robot(&self) -> RobotSource {
-        let sensors: Vec<&str> = self.sensors.iter().map(String::as_str).collect();
-        let source = RobotSource::new(&sensors);
-        if self.early { source.with_early() } else { source }
-    }
+/// Returns the places where the hub of the domain `name` may run: below `root`, or in each directory that a hub may have
+/// chosen. Without a name, the domain is the one that SCANHUB_DOMAIN names, otherwise `scanhub`.
+///
+/// # Errors
+///
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if the name is invalid, or the directory too long.
+pub fn domain_candidates(name: Option<&str>, root: Option<&Path>) -> Result<Vec<Domain>, Error> {
+    let name = name.map_or_else(domain_of_process, str::to_owned);
+    Ok(Domain::candidates(&name, root, &Environment::of_process())?)
 }
 
 /// Returns the name of the domain that SCANHUB_DOMAIN names, or the default.

@@ -18,13 +18,12 @@ use crate::presence::{GRACE, find};
 /// ```no_run
 /// use std::sync::atomic::AtomicBool;
 ///
-/// use scanhub_client::{DEFAULT_DOMAIN, Domain, Environment, Error, Request, Verb, request};
+/// use scanhub_client::{Error, Request, Verb, domain_candidates, request};
 ///
 /// fn main() -> Result<(), Error> {
 ///     // Set by a signal, for example.
 ///     let stop = AtomicBool::new(false);
-///     let places = Domain::candidates(DEFAULT_DOMAIN, None, &Environment::of_process())?;
-///     request(&places, &Request::new("front", Verb::Reset), &stop)?;
+///     request(&domain_candidates(None, None)?, &Request::new("front", Verb::Reset), &stop)?;
 ///     Ok(())
 /// }
 /// ```

@@ -1,6 +1,7 @@
 //! Receives one topic of one sensor, sample by sample, and counts missed samples by their sequence numbers. It
 //! continues by itself when the hub is replaced. It never waits: the session does that.
 
+use std::mem;
 use std::ops::Deref;
 use std::time::{Duration, Instant};
 
@@ -56,6 +57,7 @@ pub struct Follower<P: Payload + ?Sized> {
     unconnected_since: Option<Instant>,
     /// Moment of the session in which no sample had arrived.
     nothing_at: Option<(u32, Instant)>,
+    silence: SilenceCheck,
 }
 
 /// Interval of the attempts to open a topic that does not exist yet.
@@ -75,17 +77,22 @@ impl<P: Payload + ?Sized> Follower<P> {
             numbers: Numbers::default(),
             unconnected_since: None,
             nothing_at: None,
+            silence: SilenceCheck::default(),
         }
     }
 
-    /// Returns whether the topic has been there at least once.
+    /// Returns whether the topic has existed at least once.
     pub fn subscribed(&self) -> bool {
         self.port.is_some()
     }
 
-    /// Returns why nothing is received. Never waits.
-    pub(crate) fn why_silent(&self, session: &mut Session, check: &mut SilenceCheck) -> Silence {
-        check.reason(session, self)
+    /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
+    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor.
+    pub fn why_silent(&mut self, session: &mut Session) -> Silence {
+        let mut silence = mem::take(&mut self.silence);
+        let reason = silence.reason(session, self);
+        self.silence = silence;
+        reason
     }
 
     pub(crate) fn sensor(&self) -> &str {
@@ -113,6 +120,7 @@ impl<P: Payload + ?Sized> Follower<P> {
         let received = self.receive_quietly(session)?;
         if received.is_some() {
             session.heard();
+            self.silence = SilenceCheck::default();
         }
         Ok(received)
     }

@@ -4,7 +4,7 @@
 //! Each topic is in order, so one sample of each is enough: if their numbers differ, the earlier one has no partner.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use scanhub_schema::Header;
 use scanhub_shm::Payload;
@@ -14,7 +14,9 @@ use crate::clock;
 use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::session::Session;
-use crate::silence::{Silence, SilenceCheck};
+use crate::silence::Silence;
+use crate::subscribe::sealed::Sealed;
+use crate::subscribe::{ItemSource, Subscribe, Subscriber, WithTimeout};
 
 /// Subscribes to the topics of `sensor` that carry `A` and `B`, in the domain that SCANHUB_DOMAIN names. The samples
 /// come in pairs with the same `seq`. [`JoinedSubscriber::builder`] has options.
@@ -57,15 +59,15 @@ pub struct Joined<A: Payload + ?Sized, B: Payload + ?Sized> {
 }
 
 /// Subscriber of two topics of one sensor. A sample waits for its partner for one period at most.
-pub struct JoinedSubscriber<A: Payload + ?Sized, B: Payload + ?Sized> {
-    session: Session,
+pub type JoinedSubscriber<A, B> = Subscriber<Joined<A, B>>;
+
+/// Source of the pairs.
+pub struct PairSource<A: Payload + ?Sized, B: Payload + ?Sized> {
     first: Side<A>,
     second: Side<B>,
     discarded: Discarded,
-    timeout: Option<Duration>,
     /// Whether a pair was returned before.
     has_begun: bool,
-    silence: SilenceCheck,
 }
 
 /// State of one of the two topics.
@@ -92,115 +94,33 @@ const RECENT: usize = 128;
 /// Wait for the partner of a sample without a period, in ns.
 const NO_PERIOD_NS: u64 = 500_000_000;
 
-impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
-    /// Returns a builder of a subscriber that follows two topics of `sensor`.
-    pub fn builder(sensor: &str) -> SubscriberBuilder<JoinedSubscriber<A, B>> {
-        SubscriberBuilder::new(&[sensor])
-    }
+impl<A: Payload + ?Sized, B: Payload + ?Sized> Sealed for Joined<A, B> {}
 
-    pub(crate) fn new(session: Session, sensor: &str, timeout: Option<Duration>) -> JoinedSubscriber<A, B> {
-        let (first, second) = (Side::new(sensor), Side::new(sensor));
-        JoinedSubscriber {
-            session,
-            first,
-            second,
-            discarded: Discarded::default(),
-            timeout,
-            has_begun: false,
-            silence: SilenceCheck::default(),
-        }
-    }
+impl<A: Payload + ?Sized, B: Payload + ?Sized> WithTimeout for Joined<A, B> {}
 
-    /// Waits for the next pair; `None` only after the timeout. Up to three pairs may be held while others are received.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next).
-    #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
-    pub fn next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
-        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
-        loop {
-            if let Some(pair) = self.try_next()? {
-                return Ok(Some(pair));
-            }
-            let left = until.map(|until| until.saturating_duration_since(Instant::now()));
-            if left == Some(Duration::ZERO) {
-                return Ok(None);
-            }
-            self.wait(left.unwrap_or(Duration::MAX))?;
-        }
-    }
+impl<A: Payload + ?Sized, B: Payload + ?Sized> Subscribe for Joined<A, B> {
+    type Sensors<'a> = &'a str;
+    type Item = Joined<A, B>;
+    type Source = PairSource<A, B>;
 
-    /// Returns an iterator over the pairs, which waits for each of them. It ends after a silence of the timeout; a
-    /// later call continues.
-    pub fn iter(&mut self) -> impl Iterator<Item = Result<Joined<A, B>, Error>> + '_ {
-        std::iter::from_fn(|| self.next().transpose())
+    fn source(options: &SubscriberBuilder<Joined<A, B>>) -> PairSource<A, B> {
+        let (first, second) = (Side::new(options.sensor()), Side::new(options.sensor()));
+        PairSource { first, second, discarded: Discarded::default(), has_begun: false }
     }
+}
 
-    /// Returns the next pair if both of its samples have arrived. It never waits.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<Joined<A, B>>, Error> {
-        loop {
-            if let Some(pair) = self.look()? {
-                return Ok(Some(pair));
-            }
-            let left = self.left();
-            if !self.session.settle(left)? {
-                return Ok(None);
-            }
-        }
-    }
+impl<A: Payload + ?Sized, B: Payload + ?Sized> ItemSource for PairSource<A, B> {
+    type Item = Joined<A, B>;
 
-    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until a sample has waited for its partner long
-    /// enough.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.session.wait_for(Some(self.left().map_or(longest, |left| left.min(longest))))
-    }
-
-    /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`](crate::Subscriber::hub_is_running)
-    /// does.
-    pub fn hub_is_running(&self) -> bool {
-        self.session.domain().is_some()
-    }
-
-    /// Returns the time since a sample of either topic, as [`Subscriber::silent_for`](crate::Subscriber::silent_for)
-    /// does.
-    pub fn silent_for(&self) -> Duration {
-        self.session.silent_for()
-    }
-
-    /// Returns why no sample of one of the topics arrives, as
-    /// [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
-    pub fn why_silent(&mut self) -> Silence {
-        match self.first.follower.why_silent(&mut self.session, &mut self.silence) {
-            Silence::Waiting => self.second.follower.why_silent(&mut self.session, &mut self.silence),
-            reason => reason,
-        }
-    }
-
-    fn look(&mut self) -> Result<Option<Joined<A, B>>, Error> {
-        // Samples that have arrived come first, because the look for the hub takes longer than receiving.
-        let is_subscribed = self.first.follower.subscribed() && self.second.follower.subscribed();
-        if is_subscribed && let Some(pair) = self.join()? {
-            self.silence.end();
-            return Ok(Some(pair));
-        }
-        self.session.look()?;
-        self.join()
+    fn subscribed(&self) -> bool {
+        self.first.follower.subscribed() && self.second.follower.subscribed()
     }
 
     /// Receives until there is a pair, or nothing more to receive.
-    fn join(&mut self) -> Result<Option<Joined<A, B>>, Error> {
+    fn receive(&mut self, session: &mut Session) -> Result<Option<Joined<A, B>>, Error> {
         loop {
-            self.first.fill(&mut self.session)?;
-            self.second.fill(&mut self.session)?;
+            self.first.fill(session)?;
+            self.second.fill(session)?;
             let is_first_earlier = match (self.first.header(), self.second.header()) {
                 (Some(a), Some(b)) if (a.boot, a.seq) == (b.boot, b.seq) => return Ok(self.pair()),
                 (Some(a), Some(b)) if a.boot == b.boot => a.seq < b.seq,
@@ -215,6 +135,21 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
         }
     }
 
+    /// Returns the time until a sample has waited for its partner long enough.
+    fn left(&self) -> Option<Duration> {
+        let overdue = [self.first.overdue_ns(), self.second.overdue_ns()].into_iter().flatten().min()?;
+        Some(Duration::from_nanos(overdue.saturating_sub(clock::now_ns())))
+    }
+
+    fn why_silent(&mut self, session: &mut Session) -> Silence {
+        match self.first.follower.why_silent(session) {
+            Silence::Waiting => self.second.follower.why_silent(session),
+            reason => reason,
+        }
+    }
+}
+
+impl<A: Payload + ?Sized, B: Payload + ?Sized> PairSource<A, B> {
     fn pair(&mut self) -> Option<Joined<A, B>> {
         let (first, second) = (self.first.waiting.take()?.0, self.second.waiting.take()?.0);
         // A telegram without a sample of one topic may have a sample of the other one, which was dropped.
@@ -224,12 +159,6 @@ impl<A: Payload + ?Sized, B: Payload + ?Sized> JoinedSubscriber<A, B> {
         let restarted =
             std::mem::take(&mut self.first.restarted) | std::mem::take(&mut self.second.restarted);
         Some(Joined { first, second, missed, restarted })
-    }
-
-    /// Returns the time until a sample has waited for its partner long enough.
-    fn left(&self) -> Option<Duration> {
-        let overdue = [self.first.overdue_ns(), self.second.overdue_ns()].into_iter().flatten().min()?;
-        Some(Duration::from_nanos(overdue.saturating_sub(clock::now_ns())))
     }
 }
 

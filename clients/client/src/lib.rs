@@ -6,7 +6,7 @@
 //! - [`joined`] subscribes to two topics, and returns the samples of one telegram in pairs.
 //! - [`zones`] and [`robot`] subscribe to the verdict of one sensor and of all. After a silence, it is
 //!   [`Verdict::Unknown`].
-//! - `SubscriberBuilder::open_pollable` returns a subscriber with a descriptor for `poll` or an executor. With the
+//! - [`SubscriberBuilder::open_pollable`] returns a subscriber with a descriptor for `poll` or an executor. With the
 //!   feature `tokio`, it is a stream.
 //! - [`publish`] creates a topic for other programs.
 //! - [`request`] sends a request to the hub, and [`live_sensors`] returns its sensors.
@@ -52,17 +52,17 @@ mod subscribe;
 mod wait;
 mod zones;
 
-pub use builder::SubscriberBuilder;
+pub use builder::{SubscriberBuilder, domain_candidates};
 pub use control::request;
 pub use error::{Cause, Error, ErrorKind};
 pub use follower::Received;
 pub use joined::{Joined, JoinedSubscriber, joined};
-pub use pollable::{Pollable, PollableSubscriber};
+pub use pollable::PollableSubscriber;
 pub use presence::{live_sensors, live_topics};
 pub use publish::{Publication, PublishSession, SensorPublisher, publish, publish_domain};
 pub use robot::{Robot, RobotSubscriber, robot};
 pub use silence::Silence;
-pub use subscribe::{Iter, Subscriber, subscribe};
+pub use subscribe::{Iter, Subscribe, Subscriber, WithTimeout, subscribe};
 pub use wait::Wait;
 pub use zones::{Heard, ZonesSubscriber, zones};
 
@@ -105,11 +105,10 @@ impl<P: scanhub_shm::Payload + ?Sized> Payload for P {
 ///
 /// ```no_run
 /// use scanhub_client::streams::{Session, Source};
-/// use scanhub_client::{DEFAULT_DOMAIN, Domain, Environment, Error, Topic};
+/// use scanhub_client::{Error, Topic, domain_candidates};
 ///
 /// fn main() -> Result<(), Error> {
-///     let places = Domain::candidates(DEFAULT_DOMAIN, None, &Environment::of_process())?;
-///     let mut session = Session::new(places);
+///     let mut session = Session::new(domain_candidates(None, None)?);
 ///     let mut sources = [Source::new("front", Topic::Scan), Source::new("rear", Topic::Scan)];
 ///     loop {
 ///         session.look()?;
@@ -129,7 +128,6 @@ pub mod streams {
     pub use crate::robot::{RobotHeard, RobotSource};
     pub use crate::sample::{Sample, Source};
     pub use crate::session::Session;
-    pub use crate::silence::SilenceCheck;
     pub use crate::zones::{Freshness, ZonesSource, ZonesState};
 }
 

@@ -1,22 +1,24 @@
-//! Subscribers for programs that also wait for other things: with a descriptor for `poll`, `epoll` or an executor.
+//! Subscriber for programs that also wait for other things: with a descriptor for `poll`, `epoll` or an executor.
 
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use scanhub_shm::Payload;
-
 use crate::error::Error;
-use crate::follower::Received;
-use crate::joined::{Joined, JoinedSubscriber};
-use crate::robot::{Robot, RobotSubscriber};
 use crate::silence::Silence;
 #[cfg(feature = "tokio")]
 use crate::stream::Registration;
-use crate::subscribe::Subscriber;
-use crate::zones::{Heard, ZonesSubscriber};
+use crate::subscribe::{Subscribe, Subscriber};
 
-/// [`Subscriber`] with a descriptor. [`SubscriberBuilder::open_pollable`](crate::SubscriberBuilder) creates it.
+/// [`Subscriber`] with a descriptor that is readable while there may be something to take. Poll it, never read it. While
+/// it is readable, `poll` returns at once, until [`try_next`](Self::try_next) returns `None`.
+/// [`SubscriberBuilder::open_pollable`](crate::SubscriberBuilder::open_pollable) creates it.
+///
+/// The descriptor can be readable although nothing has arrived: once a second while a hub runs, when another topic of
+/// the sensor has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. For
+/// zones and robots, it also becomes readable when a verdict becomes too old. The descriptor stays the same for the
+/// subscriber's life, even if the hub restarts, and a program that the process starts does not inherit it. With the
+/// feature `tokio`, the subscriber is a `Stream`.
 ///
 /// # Examples
 ///
@@ -39,26 +41,17 @@ use crate::zones::{Heard, ZonesSubscriber};
 /// # #[allow(unreachable_code)]
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
-pub type PollableSubscriber<P> = Pollable<Subscriber<P>>;
-
-/// Subscriber with a descriptor that is readable while there may be something to take. Poll it, never read it. While it
-/// is readable, `poll` returns at once, until `try_next` returns `None`.
-///
-/// It can be readable although nothing has arrived: once a second while a hub runs, when another topic of the sensor
-/// has a sample, and when a hub starts or ends. Without a hub, it is readable only if something changes. The descriptor
-/// stays the same for the subscriber's life, even if the hub restarts, and a program that the process starts does not
-/// inherit it. With the feature `tokio`, the subscriber is a `Stream`.
-pub struct Pollable<T> {
+pub struct PollableSubscriber<T: Subscribe + ?Sized> {
     descriptor: Arc<OwnedFd>,
     // A lock, so that `try_next` works while an executor borrows the descriptor.
-    subscriber: Mutex<T>,
+    subscriber: Mutex<Subscriber<T>>,
     #[cfg(feature = "tokio")]
     registration: Registration,
 }
 
-impl<T> Pollable<T> {
-    pub(crate) fn new(descriptor: Arc<OwnedFd>, subscriber: T) -> Pollable<T> {
-        Pollable {
+impl<T: Subscribe + ?Sized> PollableSubscriber<T> {
+    pub(crate) fn new(descriptor: Arc<OwnedFd>, subscriber: Subscriber<T>) -> PollableSubscriber<T> {
+        PollableSubscriber {
             descriptor,
             subscriber: Mutex::new(subscriber),
             #[cfg(feature = "tokio")]
@@ -66,47 +59,12 @@ impl<T> Pollable<T> {
         }
     }
 
-    /// Returns the subscriber, for example to wait with its `next`.
-    pub fn subscriber_mut(&mut self) -> &mut T {
-        self.subscriber.get_mut().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    #[cfg(feature = "tokio")]
-    pub(crate) fn registration(&mut self) -> (&mut Registration, &Arc<OwnedFd>) {
-        (&mut self.registration, &self.descriptor)
-    }
-
-    fn locked(&self) -> MutexGuard<'_, T> {
-        self.subscriber.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl<T> AsFd for Pollable<T> {
-    fn as_fd(&self) -> BorrowedFd<'_> {
-        self.descriptor.as_fd()
-    }
-}
-
-impl<T> AsRawFd for Pollable<T> {
-    fn as_raw_fd(&self) -> RawFd {
-        self.descriptor.as_raw_fd()
-    }
-}
-
-/// So that tokio's `AsyncFd` can borrow the subscriber.
-impl<T> AsRawFd for &Pollable<T> {
-    fn as_raw_fd(&self) -> RawFd {
-        self.descriptor.as_raw_fd()
-    }
-}
-
-impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
-    /// Returns the next sample if one has arrived. It never waits.
+    /// Returns the next item if one has arrived. It never waits.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Subscriber::next`].
-    pub fn try_next(&self) -> Result<Option<Received<P>>, Error> {
+    /// Returns the errors of [`Subscriber::try_next`].
+    pub fn try_next(&self) -> Result<Option<T::Item>, Error> {
         self.locked().try_next()
     }
 
@@ -124,79 +82,37 @@ impl<P: Payload + ?Sized> Pollable<Subscriber<P>> {
     pub fn silent_for(&self) -> Duration {
         self.locked().silent_for()
     }
-}
 
-impl<A: Payload + ?Sized, B: Payload + ?Sized> Pollable<JoinedSubscriber<A, B>> {
-    /// Returns the next pair if both of its samples have arrived. It never waits.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`JoinedSubscriber::next`].
-    pub fn try_next(&self) -> Result<Option<Joined<A, B>>, Error> {
-        self.locked().try_next()
+    /// Returns the subscriber, for example to wait with its `next`.
+    pub fn subscriber_mut(&mut self) -> &mut Subscriber<T> {
+        self.subscriber.get_mut().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns whether a hub runs in the domain, as [`JoinedSubscriber::hub_is_running`] does.
-    pub fn hub_is_running(&self) -> bool {
-        self.locked().hub_is_running()
+    #[cfg(feature = "tokio")]
+    pub(crate) fn registration(&mut self) -> (&mut Registration, &Arc<OwnedFd>) {
+        (&mut self.registration, &self.descriptor)
     }
 
-    /// Returns why nothing arrives, as [`JoinedSubscriber::why_silent`] does.
-    pub fn why_silent(&self) -> Silence {
-        self.locked().why_silent()
-    }
-
-    /// Returns the duration of the silence, as [`JoinedSubscriber::silent_for`] does.
-    pub fn silent_for(&self) -> Duration {
-        self.locked().silent_for()
+    fn locked(&self) -> MutexGuard<'_, Subscriber<T>> {
+        self.subscriber.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Pollable<ZonesSubscriber> {
-    /// Returns the news, if there are any since the last call. It never waits. The descriptor becomes readable when the
-    /// verdict becomes too old, too.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`ZonesSubscriber::next`].
-    pub fn try_next(&self) -> Result<Option<Heard>, Error> {
-        self.locked().try_next()
-    }
-
-    /// Returns whether a hub runs in the domain, as [`ZonesSubscriber::hub_is_running`] does.
-    pub fn hub_is_running(&self) -> bool {
-        self.locked().hub_is_running()
-    }
-
-    /// Returns why nothing arrives, as [`ZonesSubscriber::why_silent`] does.
-    pub fn why_silent(&self) -> Silence {
-        self.locked().why_silent()
-    }
-
-    /// Returns the duration of the silence, as [`ZonesSubscriber::silent_for`] does.
-    pub fn silent_for(&self) -> Duration {
-        self.locked().silent_for()
+impl<T: Subscribe + ?Sized> AsFd for PollableSubscriber<T> {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.descriptor.as_fd()
     }
 }
 
-impl Pollable<RobotSubscriber> {
-    /// Returns what is known now, if anything has changed since the last call. It never waits. The descriptor becomes
-    /// readable when a verdict becomes too old, too.
-    ///
-    /// # Errors
-    ///
-    /// Returns the errors of [`RobotSubscriber::next`].
-    pub fn try_next(&self) -> Result<Option<Robot>, Error> {
-        Ok(self.locked().try_next()?.cloned())
+impl<T: Subscribe + ?Sized> AsRawFd for PollableSubscriber<T> {
+    fn as_raw_fd(&self) -> RawFd {
+        self.descriptor.as_raw_fd()
     }
+}
 
-    /// Returns whether a hub runs in the domain, as [`RobotSubscriber::hub_is_running`] does.
-    pub fn hub_is_running(&self) -> bool {
-        self.locked().hub_is_running()
-    }
-
-    /// Returns the duration of the silence, as [`RobotSubscriber::silent_for`] does.
-    pub fn silent_for(&self) -> Duration {
-        self.locked().silent_for()
+/// So that tokio's `AsyncFd` can borrow the subscriber.
+impl<T: Subscribe + ?Sized> AsRawFd for &PollableSubscriber<T> {
+    fn as_raw_fd(&self) -> RawFd {
+        self.descriptor.as_raw_fd()
     }
 }

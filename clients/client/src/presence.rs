@@ -264,9 +264,9 @@ pub const GRACE: Duration = Duration::from_millis(500);
 /// # Examples
 ///
 /// ```
-/// use scanhub_client::{Domain, Environment, live_sensors};
+/// use scanhub_client::{domain_candidates, live_sensors};
 ///
-/// let places = Domain::candidates("no-hub-is-here", None, &Environment::of_process())?;
+/// let places = domain_candidates(Some("no-hub-is-here"), None)?;
 /// assert!(live_sensors(&places).is_empty());
 /// # Ok::<(), scanhub_client::Error>(())
 /// ```

@@ -9,6 +9,9 @@ use crate::clock;
 use crate::error::Error;
 use crate::presence::{GRACE, Who};
 use crate::session::Session;
+use crate::silence::Silence;
+use crate::subscribe::sealed::Sealed;
+use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 use crate::zones::{Freshness, Heard, ZonesSource};
 
 /// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
@@ -87,91 +90,66 @@ impl Robot {
     }
 }
 
-/// The verdict of a robot that is being followed.
-pub struct RobotSubscriber {
-    session: Session,
-    source: RobotSource,
-}
+/// Subscriber of the verdict of a robot.
+pub type RobotSubscriber = Subscriber<Robot>;
 
-impl RobotSubscriber {
-    /// Returns a builder of a subscriber that follows the zones of `sensors`, or without names those of all sensors.
-    pub fn builder(sensors: &[&str]) -> SubscriberBuilder<RobotSubscriber> {
-        SubscriberBuilder::new(sensors)
-    }
-
-    pub(crate) fn new(session: Session, source: RobotSource) -> RobotSubscriber {
-        RobotSubscriber { session, source }
-    }
-
+impl Subscriber<Robot> {
     /// Waits until zones of any sensor arrive, or become too old, and returns what is known then. The first call waits
-    /// until this is so for each sensor. A sensor becomes unknown as with
-    /// [`ZonesSubscriber::next`](crate::ZonesSubscriber::next).
+    /// until this is so for each sensor. A sensor becomes unknown as with [`ZonesSubscriber`](crate::ZonesSubscriber).
     ///
     /// # Errors
     ///
     /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The verdict is unknown then, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
-    pub fn next(&mut self) -> Result<&Robot, Error> {
-        while !self.hear()? {
-            self.wait(Duration::MAX)?;
-        }
-        Ok(self.source.robot())
+    pub fn next(&mut self) -> Result<Robot, Error> {
+        self.wait_for_next()
     }
 
-    /// Returns what is known now; never waits.
+    /// Returns what is known now, whether or not it is news. It never waits.
     ///
     /// # Errors
     ///
-    /// As [`next`](Self::next).
+    /// Returns the errors of [`next`](Self::next).
     pub fn now(&mut self) -> Result<&Robot, Error> {
-        self.hear()?;
+        self.source.hear_all(&mut self.session)?;
         Ok(self.source.robot())
     }
+}
 
-    /// Returns what is known now, if anything was heard, or became too old, since the last call; never waits.
-    ///
-    /// # Errors
-    ///
-    /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<&Robot>, Error> {
-        loop {
-            if self.hear()? {
-                return Ok(Some(self.source.robot()));
-            }
-            if !self.session.settle(self.source.left())? {
-                return Ok(None);
-            }
-        }
+impl Sealed for Robot {}
+
+impl Subscribe for Robot {
+    type Sensors<'a> = &'a [&'a str];
+    type Item = Robot;
+    type Source = RobotSource;
+
+    fn source(options: &SubscriberBuilder<Robot>) -> RobotSource {
+        let source = RobotSource::new(&options.sensors());
+        if options.is_early() { source.with_early() } else { source }
+    }
+}
+
+impl ItemSource for RobotSource {
+    type Item = Robot;
+
+    fn subscribed(&self) -> bool {
+        self.subscribed()
     }
 
-    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until a verdict becomes too old.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+    fn receive(&mut self, session: &mut Session) -> Result<Option<Robot>, Error> {
+        Ok(self.drain(session)?.then(|| self.robot.clone()))
     }
 
-    /// Returns whether a hub or a listener publishes in the domain, as of the last call of
-    /// [`next`](Self::next), [`now`](Self::now) or [`try_next`](Self::try_next) that found no news.
-    pub fn hub_is_running(&self) -> bool {
-        self.session.domain().is_some()
+    fn look(&mut self, session: &mut Session) -> Result<Option<Robot>, Error> {
+        Ok(self.hear_all(session)?.then(|| self.robot.clone()))
     }
 
-    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which
-    /// the machine was suspended counts (CLOCK_BOOTTIME).
-    pub fn silent_for(&self) -> Duration {
-        self.session.silent_for()
+    fn left(&self) -> Option<Duration> {
+        self.left()
     }
 
-    /// Takes all samples that have arrived. Returns whether there were any.
-    fn hear(&mut self) -> Result<bool, Error> {
-        // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
-        // notice a new hub.
-        let heard = self.source.drain(&mut self.session)?;
-        self.session.look()?;
-        Ok(self.source.drain(&mut self.session)? || heard)
+    fn why_silent(&mut self, session: &mut Session) -> Silence {
+        self.why_silent(session)
     }
 }
 
@@ -289,6 +267,27 @@ impl RobotSource {
             any = true;
         }
         Ok(any)
+    }
+
+    /// Takes all samples and silences, and looks for the hub. Returns whether there were any.
+    fn hear_all(&mut self, session: &mut Session) -> Result<bool, Error> {
+        // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
+        // notice a new hub.
+        let heard = self.drain(session)?;
+        session.look()?;
+        Ok(self.drain(session)? || heard)
+    }
+
+    /// Returns the reason of the first sensor whose verdict is unknown and that has a reason. Without sensors, it is
+    /// the reason why no hub runs.
+    pub fn why_silent(&mut self, session: &mut Session) -> Silence {
+        if let Some(reason) = Silence::of_hub(session) {
+            return reason;
+        }
+        let verdicts = self.robot.sensors().map(|(_, verdict)| verdict);
+        let unknown = self.parts.iter_mut().zip(verdicts).filter(|(_, verdict)| *verdict == Verdict::Unknown);
+        let mut reasons = unknown.map(|(part, _)| part.why_silent(session));
+        reasons.find(|reason| *reason != Silence::Waiting).unwrap_or(Silence::Waiting)
     }
 
     fn hear(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {

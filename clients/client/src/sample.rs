@@ -11,7 +11,7 @@ use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
-use crate::silence::{Silence, SilenceCheck};
+use crate::silence::Silence;
 use crate::zones::{Heard, ZonesSource};
 
 /// Zones are followed with an eye on their age, all else as it comes.
@@ -77,13 +77,11 @@ macro_rules! samples {
                 }
             }
 
-            /// Returns why nothing is received. It never waits, and is cheap enough for once a second. The first
-            /// call with a new `check` can return [`Silence::Waiting`], because it has just subscribed to the status.
-            pub fn why_silent(&self, session: &mut Session, check: &mut SilenceCheck) -> Silence {
+            /// Returns why no sample arrives, as [`Follower::why_silent`] does.
+            pub fn why_silent(&mut self, session: &mut Session) -> Silence {
                 match self {
-                    $(Source::$topic(source) => source.why_silent(session, check),)*
-                    Source::Robot(_) if session.domain().is_none() => session.absence(),
-                    Source::Robot(_) => Silence::Waiting,
+                    $(Source::$topic(source) => source.why_silent(session),)*
+                    Source::Robot(source) => source.why_silent(session),
                 }
             }
 

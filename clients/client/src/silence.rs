@@ -76,6 +76,18 @@ pub enum Silence {
 }
 
 impl Silence {
+    /// Returns the reason if the hub is missing, or if memory or descriptors are too short to find it.
+    pub(crate) fn of_hub(session: &mut Session) -> Option<Silence> {
+        match session.look() {
+            Err(error) => Some(Silence::of_shortage(&error)),
+            Ok(_) => session.domain().is_none().then(|| session.absence()),
+        }
+    }
+
+    fn of_shortage(error: &Error) -> Silence {
+        Silence::Full { message: error.message(), remedy: error.remedy() }
+    }
+
     /// Returns the reason that the status of a sensor shows.
     pub(crate) fn of_status(sensor: &str, status: &Status) -> Silence {
         let sensor = sensor.to_owned();
@@ -148,10 +160,10 @@ impl fmt::Display for Silence {
     }
 }
 
-/// Finds the reason for the silence of one topic of one sensor. From the first call of
-/// [`Source::why_silent`](crate::streams::Source::why_silent) on, it subscribes to the sensor's status.
+/// Finds the reason for the silence of one topic of one sensor. From the first call of [`reason`](Self::reason) on, it
+/// subscribes to the sensor's status.
 #[derive(Default)]
-pub struct SilenceCheck {
+pub(crate) struct SilenceCheck {
     status: Option<Box<SensorStatus>>,
 }
 
@@ -170,24 +182,21 @@ impl SilenceCheck {
         session: &mut Session,
         follower: &Follower<P>,
     ) -> Silence {
-        let exhausted = |error: &Error| Silence::Full { message: error.message(), remedy: error.remedy() };
-        if let Err(error) = session.look() {
-            return exhausted(&error);
+        if let Some(reason) = Silence::of_hub(session) {
+            self.status = None;
+            return reason;
         }
         if let Some(error) = follower.refused() {
-            return exhausted(error);
+            return Silence::of_shortage(error);
         }
-        let Some(domain) = session.domain() else {
-            self.status = None;
-            return session.absence();
-        };
+        let Some(domain) = session.domain() else { return Silence::Waiting };
         let (sensor, topic) = (follower.sensor(), <P as Payload>::TOPIC);
         // In this order: a hub has all its topics when it is not starting any more.
         let is_starting = session.hub_is_starting();
         // The port of a program that stays in the domain is still open if the next hub lacks the topic.
         let is_served = match session.node().map(|node| has_publisher(node, sensor, topic)) {
             Some(Ok(is_served)) => is_served,
-            Some(Err(failure)) => return exhausted(&failure.into()),
+            Some(Err(failure)) => return Silence::of_shortage(&failure.into()),
             None => false,
         };
         if !follower.is_attached(session) || !is_served {
@@ -197,7 +206,7 @@ impl SilenceCheck {
             }
             return match published(session, domain, sensor) {
                 Ok(published) => Silence::of_topics(sensor, topic, &published).unwrap_or(Silence::Waiting),
-                Err(failure) => exhausted(&failure.into()),
+                Err(failure) => Silence::of_shortage(&failure.into()),
             };
         }
         if topic.maker() != Maker::Link {
@@ -213,11 +222,6 @@ impl SilenceCheck {
             status.last = Some(*received);
         }
         status.last.as_ref().map_or(Silence::Waiting, |status| Silence::of_status(sensor, status))
-    }
-
-    /// Ends the subscription to the status. Call it when a sample has arrived.
-    pub fn end(&mut self) {
-        self.status = None;
     }
 }
 

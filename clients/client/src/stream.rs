@@ -1,4 +1,4 @@
-//! Samples as an asynchronous stream, for tokio (feature `tokio`).
+//! Subscriber as an asynchronous stream, for tokio (feature `tokio`).
 
 use std::os::fd::OwnedFd;
 use std::pin::Pin;
@@ -7,18 +7,13 @@ use std::task::{Context, Poll, ready};
 
 use futures_core::Stream;
 use scanhub_schema::Kind;
-use scanhub_shm::Payload;
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::runtime::Handle;
 
 use crate::error::Error;
-use crate::follower::Received;
-use crate::joined::{Joined, JoinedSubscriber};
-use crate::pollable::Pollable;
-use crate::robot::{Robot, RobotSubscriber};
-use crate::subscribe::Subscriber;
-use crate::zones::{Heard, ZonesSubscriber};
+use crate::pollable::PollableSubscriber;
+use crate::subscribe::Subscribe;
 
 /// Registration of a descriptor at the runtime that polls the stream.
 #[derive(Default)]
@@ -64,59 +59,22 @@ impl Registration {
 }
 
 /// No field is pinned.
-impl<T> Unpin for Pollable<T> {}
+impl<T: Subscribe + ?Sized> Unpin for PollableSubscriber<T> {}
 
-impl<T> Pollable<T> {
-    /// Returns the next item of `take`, which never waits. No item is kept here, so a dropped future loses none.
-    fn poll_items<I>(
-        &mut self,
-        cx: &mut Context<'_>,
-        mut take: impl FnMut(&mut T) -> Result<Option<I>, Error>,
-    ) -> Poll<Option<Result<I, Error>>> {
+/// Items as they arrive. The stream never ends. It keeps no item, so a dropped future loses none.
+impl<T: Subscribe + ?Sized> Stream for PollableSubscriber<T> {
+    type Item = Result<T::Item, Error>;
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let this = self.get_mut();
         loop {
-            if let Some(item) = take(self.subscriber_mut()).transpose() {
+            if let Some(item) = this.subscriber_mut().try_next().transpose() {
                 return Poll::Ready(Some(item));
             }
-            let (registration, descriptor) = self.registration();
+            let (registration, descriptor) = this.registration();
             if let Err(error) = ready!(registration.poll_readable(descriptor, cx)) {
                 return Poll::Ready(Some(Err(error)));
             }
         }
-    }
-}
-
-/// Samples as they arrive. The stream never ends, and a dropped future loses no sample.
-impl<P: Payload + ?Sized> Stream for Pollable<Subscriber<P>> {
-    type Item = Result<Received<P>, Error>;
-
-    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.get_mut().poll_items(cx, Subscriber::try_next)
-    }
-}
-
-/// Pairs as they arrive. The stream never ends, and a dropped future loses no pair.
-impl<A: Payload + ?Sized, B: Payload + ?Sized> Stream for Pollable<JoinedSubscriber<A, B>> {
-    type Item = Result<Joined<A, B>, Error>;
-
-    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.get_mut().poll_items(cx, JoinedSubscriber::try_next)
-    }
-}
-
-/// Samples, and the silences between them. The stream never ends.
-impl Stream for Pollable<ZonesSubscriber> {
-    type Item = Result<Heard, Error>;
-
-    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.get_mut().poll_items(cx, ZonesSubscriber::try_next)
-    }
-}
-
-/// States of the robot's surroundings, after each change. The stream never ends.
-impl Stream for Pollable<RobotSubscriber> {
-    type Item = Result<Robot, Error>;
-
-    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.get_mut().poll_items(cx, |robot| Ok(robot.try_next()?.cloned()))
     }
 }

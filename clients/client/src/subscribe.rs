@@ -1,5 +1,5 @@
-//! Subscribes to one topic of one sensor, without copies. Waits for a hub that does not run yet, and continues when
-//! the hub is restarted.
+//! Subscribers of any kind, and the one of a topic: it makes no copies, waits for a hub that does not run yet, and
+//! continues when the hub is restarted.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use crate::builder::SubscriberBuilder;
 use crate::error::Error;
 use crate::follower::{Follower, Received};
 use crate::session::Session;
-use crate::silence::{Silence, SilenceCheck};
+use crate::silence::Silence;
 
 /// Subscribes to the topic of `sensor` that carries `P` ([`Telegram`](crate::Telegram), [`Scan`](crate::Scan),
 /// [`Marks`](crate::Marks) ..), in the domain that SCANHUB_DOMAIN names. The hub may start later. To act on zones, use
@@ -36,49 +36,116 @@ pub fn subscribe<P: Payload + ?Sized>(sensor: &str) -> Result<Subscriber<P>, Err
     Subscriber::builder(sensor).open()
 }
 
-/// Subscriber of one topic of one sensor.
-pub struct Subscriber<P: Payload + ?Sized> {
-    session: Session,
-    follower: Follower<P>,
+/// Subscriber of one topic of one sensor, as `Subscriber<Scan>`. [`JoinedSubscriber`](crate::JoinedSubscriber),
+/// [`ZonesSubscriber`](crate::ZonesSubscriber) and [`RobotSubscriber`](crate::RobotSubscriber) are subscribers, too.
+pub struct Subscriber<T: Subscribe + ?Sized> {
+    pub(crate) session: Session,
+    pub(crate) source: T::Source,
     timeout: Option<Duration>,
-    silence: SilenceCheck,
 }
 
-impl<P: Payload + ?Sized> Subscriber<P> {
-    /// Returns the options of a subscriber of `sensor`.
-    pub fn builder(sensor: &str) -> SubscriberBuilder<Subscriber<P>> {
-        SubscriberBuilder::new(&[sensor])
+/// Kind of a [`Subscriber`]: a payload such as [`Scan`](crate::Scan), [`Joined`](crate::Joined),
+/// [`Heard`](crate::Heard) or [`Robot`](crate::Robot). Other crates cannot implement it.
+pub trait Subscribe: sealed::Sealed {
+    /// Names of the sensors: `&str`, or `&[&str]` for a robot.
+    type Sensors<'a>: SensorNames;
+    /// Item that the subscriber returns.
+    type Item;
+    /// Part that receives the items.
+    #[doc(hidden)]
+    type Source: ItemSource<Item = Self::Item>;
+
+    /// Creates the source of a subscriber with these options.
+    #[doc(hidden)]
+    fn source(options: &SubscriberBuilder<Self>) -> Self::Source;
+}
+
+/// Kind of a [`Subscriber`] whose `next` can end after a timeout. Zones and robots report `unknown` in its place.
+pub trait WithTimeout: Subscribe {}
+
+/// Names of one or several sensors.
+pub trait SensorNames {
+    /// Returns the names.
+    fn names(self) -> Vec<String>;
+}
+
+impl SensorNames for &str {
+    fn names(self) -> Vec<String> {
+        vec![self.to_owned()]
+    }
+}
+
+impl SensorNames for &[&str] {
+    fn names(self) -> Vec<String> {
+        self.iter().map(|&sensor| sensor.to_owned()).collect()
+    }
+}
+
+/// Source of items in the session of its subscriber. It never waits.
+pub trait ItemSource {
+    /// Received item.
+    type Item;
+
+    /// Returns whether an item can arrive without a look for the hub.
+    fn subscribed(&self) -> bool;
+
+    /// Returns the next item that has arrived.
+    fn receive(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error>;
+
+    /// Looks for the hub if necessary, and returns the next item that has arrived.
+    fn look(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error> {
+        // Samples that have arrived come first, because the look for the hub takes longer than receiving.
+        if self.subscribed()
+            && let Some(item) = self.receive(session)?
+        {
+            return Ok(Some(item));
+        }
+        session.look()?;
+        self.receive(session)
     }
 
-    pub(crate) fn new(session: Session, sensor: &str, timeout: Option<Duration>) -> Subscriber<P> {
-        Subscriber { session, follower: Follower::new(sensor), timeout, silence: SilenceCheck::default() }
+    /// Returns the time after which there is something to receive although no sample arrives. `None` if there never is.
+    fn left(&self) -> Option<Duration> {
+        None
     }
 
-    /// Waits for the next sample; `None` only after the timeout. Up to four samples may be held while others are
-    /// received.
+    /// Returns why no item arrives.
+    fn why_silent(&mut self, session: &mut Session) -> Silence;
+}
+
+/// Seal of [`Subscribe`].
+pub(crate) mod sealed {
+    pub trait Sealed {}
+}
+
+impl<T: Subscribe + ?Sized> Subscriber<T> {
+    /// Returns the options of a subscriber of a sensor, for example `"front"`, or of a robot's sensors, for example
+    /// `&["front", "rear"]`. A robot without names follows all sensors.
+    pub fn builder(sensors: T::Sensors<'_>) -> SubscriberBuilder<T> {
+        SubscriberBuilder::new(sensors.names())
+    }
+
+    pub(crate) fn new(session: Session, source: T::Source, timeout: Option<Duration>) -> Subscriber<T> {
+        Subscriber { session, source, timeout }
+    }
+
+    /// Returns the next item if one has arrived. It never waits.
     ///
     /// # Errors
     ///
-    /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived.
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers have run
-    /// out. [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
-    #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
-    pub fn next(&mut self) -> Result<Option<Received<P>>, Error> {
-        // A timeout beyond all time is none.
-        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+    /// Returns the errors of `next`.
+    pub fn try_next(&mut self) -> Result<Option<T::Item>, Error> {
         loop {
-            if let Some(received) = self.try_next()? {
-                return Ok(Some(received));
+            if let Some(item) = self.source.look(&mut self.session)? {
+                return Ok(Some(item));
             }
-            if until.is_some_and(|until| Instant::now() >= until) {
+            if !self.session.settle(self.source.left())? {
                 return Ok(None);
             }
-            self.session.wait(until)?;
         }
     }
 
-    /// Returns an iterator over the samples, which waits for each of them. It ends after a silence of the timeout; a
-    /// later call continues.
+    /// Returns an iterator that waits for each item. It ends after a silence of the timeout; a later call continues.
     ///
     /// # Examples
     ///
@@ -99,38 +166,21 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     ///     Ok(())
     /// }
     /// ```
-    pub fn iter(&mut self) -> Iter<'_, P> {
+    pub fn iter(&mut self) -> Iter<'_, T> {
         Iter(self)
     }
 
-    /// Returns the next sample if one has arrived. It never waits.
-    ///
-    /// # Errors
-    ///
-    /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<Received<P>>, Error> {
-        loop {
-            if let Some(received) = self.look()? {
-                return Ok(Some(received));
-            }
-            if !self.session.settle(None)? {
-                return Ok(None);
-            }
-        }
-    }
-
-    /// Sleeps until there may be a sample, but at most for `longest` and a tenth of a second, so that the caller can
+    /// Sleeps until there may be an item, but at most for `longest` and a tenth of a second, so that the caller can
     /// stop.
     ///
     /// # Errors
     ///
     /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
     pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.session.wait_for(Some(longest))
+        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
     }
 
-    /// Returns whether a hub runs in the domain, as of the last call of [`next`](Self::next) or
-    /// [`try_next`](Self::try_next) that found no sample.
+    /// Returns whether a hub or a listener publishes in the domain, as of the last call that found no item.
     pub fn hub_is_running(&self) -> bool {
         self.session.domain().is_some()
     }
@@ -142,7 +192,8 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     }
 
     /// Returns why no sample arrives. It never waits, and is cheap enough for once a second. The first call after a
-    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor.
+    /// sample can return [`Silence::Waiting`], because it has just subscribed to the status of the sensor. A robot has
+    /// the reason of its first sensor whose verdict is unknown and that has a reason.
     ///
     /// # Examples
     ///
@@ -165,46 +216,97 @@ impl<P: Payload + ?Sized> Subscriber<P> {
     /// }
     /// ```
     pub fn why_silent(&mut self) -> Silence {
-        self.follower.why_silent(&mut self.session, &mut self.silence)
+        self.source.why_silent(&mut self.session)
     }
 
-    fn look(&mut self) -> Result<Option<Received<P>>, Error> {
-        let received = self.receive()?;
-        if received.is_some() {
-            self.silence.end();
+    /// Waits for the next item. Returns `None` only after the timeout.
+    pub(crate) fn next_until_timeout(&mut self) -> Result<Option<T::Item>, Error> {
+        // A timeout beyond all time is none.
+        let until = self.timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+        loop {
+            if let Some(item) = self.try_next()? {
+                return Ok(Some(item));
+            }
+            let left = until.map_or(Duration::MAX, |until| until.saturating_duration_since(Instant::now()));
+            if left.is_zero() {
+                return Ok(None);
+            }
+            self.wait(left)?;
         }
-        Ok(received)
     }
 
-    fn receive(&mut self) -> Result<Option<Received<P>>, Error> {
-        // Samples that have arrived come first, because the look for the hub takes longer than receiving.
-        if self.follower.subscribed()
-            && let Some(received) = self.follower.receive(&mut self.session)?
-        {
-            return Ok(Some(received));
+    /// Waits for the next item of a subscriber without a timeout.
+    pub(crate) fn wait_for_next(&mut self) -> Result<T::Item, Error> {
+        loop {
+            if let Some(item) = self.next_until_timeout()? {
+                return Ok(item);
+            }
         }
-        self.session.look()?;
-        self.follower.receive(&mut self.session)
     }
 }
 
-impl<'a, P: Payload + ?Sized> IntoIterator for &'a mut Subscriber<P> {
-    type Item = Result<Received<P>, Error>;
-    type IntoIter = Iter<'a, P>;
+impl<'a, T: Subscribe + ?Sized> IntoIterator for &'a mut Subscriber<T> {
+    type Item = Result<T::Item, Error>;
+    type IntoIter = Iter<'a, T>;
 
-    fn into_iter(self) -> Iter<'a, P> {
+    fn into_iter(self) -> Iter<'a, T> {
         self.iter()
     }
 }
 
-/// Samples of a [`Subscriber`]. Up to four may be held; with four held, the iterator returns [`Error::TooManyHeld`] in
-/// place of the next sample, which stays in the queue.
-pub struct Iter<'a, P: Payload + ?Sized>(&'a mut Subscriber<P>);
+/// Items of a [`Subscriber`]. Up to four samples may be held; with four held, the iterator returns
+/// [`Error::TooManyHeld`] in place of the next one, which stays in the queue.
+pub struct Iter<'a, T: Subscribe + ?Sized>(&'a mut Subscriber<T>);
 
-impl<P: Payload + ?Sized> Iterator for Iter<'_, P> {
-    type Item = Result<Received<P>, Error>;
+impl<T: Subscribe + ?Sized> Iterator for Iter<'_, T> {
+    type Item = Result<T::Item, Error>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        self.0.next().transpose()
+        self.0.next_until_timeout().transpose()
+    }
+}
+
+impl<T: WithTimeout + ?Sized> Subscriber<T> {
+    /// Waits for the next sample or pair; `None` only after the timeout. Up to four samples, or three pairs, may be held
+    /// while others are received.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::TooManyHeld`] if the program holds four samples and another one has arrived.
+    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if memory, descriptors or places for subscribers have run
+    /// out. [`ErrorKind::Incompatible`](crate::ErrorKind) if the topic has another layout.
+    #[allow(clippy::should_implement_trait)] // `iter` returns an iterator.
+    pub fn next(&mut self) -> Result<Option<T::Item>, Error> {
+        self.next_until_timeout()
+    }
+}
+
+impl<P: Payload + ?Sized> sealed::Sealed for P {}
+
+impl<P: Payload + ?Sized> WithTimeout for P {}
+
+impl<P: Payload + ?Sized> Subscribe for P {
+    type Sensors<'a> = &'a str;
+    type Item = Received<P>;
+    type Source = Follower<P>;
+
+    fn source(options: &SubscriberBuilder<P>) -> Follower<P> {
+        Follower::new(options.sensor())
+    }
+}
+
+impl<P: Payload + ?Sized> ItemSource for Follower<P> {
+    type Item = Received<P>;
+
+    fn subscribed(&self) -> bool {
+        self.subscribed()
+    }
+
+    fn receive(&mut self, session: &mut Session) -> Result<Option<Received<P>>, Error> {
+        self.receive(session)
+    }
+
+    fn why_silent(&mut self, session: &mut Session) -> Silence {
+        self.why_silent(session)
     }
 }

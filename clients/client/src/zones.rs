@@ -11,7 +11,9 @@ use crate::clock::{self, Moment};
 use crate::error::Error;
 use crate::follower::Follower;
 use crate::session::Session;
-use crate::silence::{Silence, SilenceCheck};
+use crate::silence::Silence;
+use crate::subscribe::sealed::Sealed;
+use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -60,91 +62,58 @@ impl Heard {
     }
 }
 
-/// The zones of a sensor that is being followed.
-pub struct ZonesSubscriber {
-    session: Session,
-    source: ZonesSource,
-    silence: SilenceCheck,
-}
+/// Subscriber of the zones of a sensor.
+pub type ZonesSubscriber = Subscriber<Heard>;
 
-impl ZonesSubscriber {
-    /// Returns a builder of a subscriber that follows the zones of `sensor`.
-    pub fn builder(sensor: &str) -> SubscriberBuilder<ZonesSubscriber> {
-        SubscriberBuilder::new(&[sensor])
-    }
-
-    pub(crate) fn new(session: Session, sensor: &str) -> ZonesSubscriber {
-        ZonesSubscriber { session, source: ZonesSource::new(sensor), silence: SilenceCheck::default() }
-    }
-
-    /// Waits for news: the newest sample, or one `unknown` per silence. That is returned two scan periods and 40 ms
-    /// after the last sample (for another machine not before half a second), or a second after the start if there was
-    /// none, with or without a hub.
+impl Subscriber<Heard> {
+    /// Waits for news: the newest sample, or one `unknown` per silence. It returns that two scan periods and 40 ms after
+    /// the last sample (for another machine not before half a second), or a second after the start if there was none,
+    /// with or without a hub.
     ///
     /// # Errors
     ///
     /// Returns the errors of [`Subscriber::next`](crate::Subscriber::next). The zones are unknown then, too.
     #[allow(clippy::should_implement_trait)] // There is no end that an iterator would have.
     pub fn next(&mut self) -> Result<Heard, Error> {
-        loop {
-            if let Some(heard) = self.try_next()? {
-                return Ok(heard);
-            }
-            self.wait(Duration::MAX)?;
+        self.wait_for_next()
+    }
+}
+
+impl Sealed for Heard {}
+
+impl Subscribe for Heard {
+    type Sensors<'a> = &'a str;
+    type Item = Heard;
+    type Source = ZonesSource;
+
+    fn source(options: &SubscriberBuilder<Heard>) -> ZonesSource {
+        ZonesSource::new(options.sensor())
+    }
+}
+
+impl ItemSource for ZonesSource {
+    type Item = Heard;
+
+    fn subscribed(&self) -> bool {
+        self.subscribed()
+    }
+
+    /// Returns the last of all samples that have arrived. The skipped ones count as missed.
+    fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
+        let mut newest: Option<Heard> = None;
+        while let Some(mut heard) = self.receive(session)? {
+            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
+            newest = Some(heard);
         }
+        Ok(newest)
     }
 
-    /// Sleeps as [`Subscriber::wait`](crate::Subscriber::wait) does, or until the verdict becomes too old.
-    ///
-    /// # Errors
-    ///
-    /// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the system cannot wait.
-    pub fn wait(&mut self, longest: Duration) -> Result<(), Error> {
-        self.session.wait_for(Some(self.source.left().map_or(longest, |left| left.min(longest))))
+    fn left(&self) -> Option<Duration> {
+        self.left()
     }
 
-    /// Returns whether a hub lives in the domain, as of the last call of [`next`](Self::next) or
-    /// [`try_next`](Self::try_next) that found no news.
-    pub fn hub_is_running(&self) -> bool {
-        self.session.domain().is_some()
-    }
-
-    /// Returns the time since the last sample; if there was none, since the subscriber was opened. Time during which
-    /// the machine was suspended counts (CLOCK_BOOTTIME).
-    pub fn silent_for(&self) -> Duration {
-        self.session.silent_for()
-    }
-
-    /// Returns why no zones arrive, as [`Subscriber::why_silent`](crate::Subscriber::why_silent) does.
-    pub fn why_silent(&mut self) -> Silence {
-        self.source.why_silent(&mut self.session, &mut self.silence)
-    }
-
-    /// Returns the news, if there are any since the last call; never waits.
-    ///
-    /// # Errors
-    ///
-    /// As [`next`](Self::next).
-    pub fn try_next(&mut self) -> Result<Option<Heard>, Error> {
-        loop {
-            if let Some(heard) = self.look()? {
-                return Ok(Some(heard));
-            }
-            if !self.session.settle(self.source.left())? {
-                return Ok(None);
-            }
-        }
-    }
-
-    fn look(&mut self) -> Result<Option<Heard>, Error> {
-        // Samples that have arrived come first, because looking for the hub takes longer than receiving.
-        if self.source.subscribed()
-            && let Some(heard) = self.source.newest(&mut self.session)?
-        {
-            return Ok(Some(heard));
-        }
-        self.session.look()?;
-        self.source.newest(&mut self.session)
+    fn why_silent(&mut self, session: &mut Session) -> Silence {
+        self.why_silent(session)
     }
 }
 
@@ -173,9 +142,9 @@ impl ZonesSource {
         self.follower.subscribed()
     }
 
-    /// Returns why no zones are received. Never waits.
-    pub(crate) fn why_silent(&self, session: &mut Session, check: &mut SilenceCheck) -> Silence {
-        check.reason(session, &self.follower)
+    /// Returns why no zones arrive, as [`Follower::why_silent`] does.
+    pub fn why_silent(&mut self, session: &mut Session) -> Silence {
+        self.follower.why_silent(session)
     }
 
     /// Returns whether the first sample has arrived, or its deadline has passed.
@@ -208,16 +177,6 @@ impl ZonesSource {
             }
         }
         Ok(None)
-    }
-
-    /// Returns the last of all samples that have arrived. The skipped ones count as missed.
-    fn newest(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
-        let mut newest: Option<Heard> = None;
-        while let Some(mut heard) = self.receive(session)? {
-            heard.missed += newest.map_or(0, |passed| passed.missed + u64::from(passed.header.is_some()));
-            newest = Some(heard);
-        }
-        Ok(newest)
     }
 
     /// Returns the time after which [`receive`](Self::receive) returns a silence if no sample arrives.

@@ -28,7 +28,7 @@ fn follow(place: &Place, sensor: &str) -> Subscriber<Marks> {
     builder(place, sensor).open().unwrap()
 }
 
-fn builder(place: &Place, sensor: &str) -> SubscriberBuilder<Subscriber<Marks>> {
+fn builder(place: &Place, sensor: &str) -> SubscriberBuilder<Marks> {
     Subscriber::builder(sensor).in_domain(&place.domain).timeout(Duration::from_secs(60))
 }
 

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::streams::find;
-use scanhub_client::{ErrorKind, Marks, Publication, Scan, Silence, Subscriber, Tilt, ZonesSubscriber};
+use scanhub_client::{
+    ErrorKind, Marks, Publication, RobotSubscriber, Scan, Silence, Subscriber, Tilt, Verdict, ZonesSubscriber,
+};
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Failure, Kind, State, Topic};
 use scanhub_shm::{Payload, PortFactory};
@@ -83,6 +85,35 @@ fn the_state_of_the_link_is_the_reason() {
     hub.front().scan(&[1000]);
     assert!(scans.next().unwrap().is_some());
     assert_eq!(hub.front().status.subscribers(), 0);
+}
+
+#[test]
+fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
+    let place = Place::new();
+    let robot = |sensors: &[&str]| RobotSubscriber::builder(sensors).in_domain(&place.domain).open().unwrap();
+    let (mut all, mut mistyped) = (robot(&[]), robot(&["front", "frnot"]));
+    for robot in [&mut all, &mut mistyped] {
+        assert!(matches!(robot.why_silent(), Silence::NoHub { .. }));
+    }
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 1);
+    hub.sensors[0].period_us = 60_000_000;
+    hub.sensors[1].period_us = 60_000_000;
+    until("the zones", || {
+        hub.sensors[0].zones(Verdict::Clear, 900);
+        [&mut all, &mut mistyped]
+            .iter_mut()
+            .all(|robot| robot.now().unwrap().sensors().any(|part| part == ("front", Verdict::Clear)))
+    });
+    until("the reason", || matches!(mistyped.why_silent(), Silence::UnknownSensor { .. }));
+    until("the state of the other sensor", || {
+        hub.sensors[1].status(|status| status.state = State::Paused as u8);
+        all.why_silent().to_string() == "rear is paused"
+    });
+    until("its zones", || {
+        hub.sensors[1].zones(Verdict::Clear, 900);
+        all.now().unwrap().verdict() == Verdict::Clear
+    });
+    assert_eq!(all.why_silent(), Silence::Waiting);
 }
 
 #[test]

@@ -29,7 +29,7 @@ fn a_builder_finds_the_hub_by_domain_and_root() {
 
 #[test]
 fn a_builder_refuses_impossible_names() {
-    let kind = |builder: SubscriberBuilder<Subscriber<Scan>>| builder.open().map(drop).unwrap_err().kind();
+    let kind = |builder: SubscriberBuilder<Scan>| builder.open().map(drop).unwrap_err().kind();
     assert_eq!(kind(Subscriber::builder("front/scan")), ErrorKind::InvalidInput);
     assert_eq!(kind(Subscriber::builder("front").domain("a b")), ErrorKind::InvalidInput);
 }

@@ -14,10 +14,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{Change, Sample as AnySample, Session, SilenceCheck, Source, find};
+use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, find};
 use scanhub_client::{
-    Domain, Environment, ErrorKind, Header, Pollable, Publication, Robot, RobotSubscriber, Silence,
-    SubscriberBuilder, Tilt, Topic, Wait,
+    Domain, ErrorKind, Header, PollableSubscriber, Publication, Robot, RobotSubscriber, Silence,
+    SubscriberBuilder, Tilt, Topic, Wait, domain_candidates,
 };
 use scanhub_schema::Failure;
 
@@ -54,7 +54,7 @@ impl Place {
     pub(crate) fn candidates(&self) -> Result<Vec<Domain>, Error> {
         let base = self.root.as_deref().map(std::path::absolute).transpose();
         let base = base.map_err(|error| Error::new("Impossible", format!("root: {error}"), ""))?;
-        Ok(Domain::candidates(&self.name(), base.as_deref(), &Environment::of_process())?)
+        Ok(domain_candidates(self.domain.as_deref(), base.as_deref())?)
     }
 
     /// Returns the location of the running hub.
@@ -68,12 +68,6 @@ impl Place {
             Some(_) => Ok(self.candidates()?.remove(0)),
             None => Ok(scanhub_client::publish_domain(self.domain.as_deref())?),
         }
-    }
-
-    fn name(&self) -> String {
-        let of_process = || std::env::var("SCANHUB_DOMAIN");
-        let name = self.domain.clone().or_else(|| of_process().ok());
-        name.unwrap_or_else(|| scanhub_client::DEFAULT_DOMAIN.to_owned())
     }
 }
 
@@ -206,7 +200,6 @@ pub(crate) struct Topics {
 struct Followed {
     name: Name,
     source: Source,
-    silence: SilenceCheck,
     last: Header,
     is_first: bool,
 }
@@ -215,13 +208,7 @@ impl Topics {
     pub(crate) fn new(names: Vec<Name>, place: &Place) -> Result<Topics, Error> {
         let sources = names.into_iter().map(|name| {
             let source = Source::new(&name.sensor, name.topic);
-            Followed {
-                name,
-                source,
-                silence: SilenceCheck::default(),
-                last: Header::default(),
-                is_first: true,
-            }
+            Followed { name, source, last: Header::default(), is_first: true }
         });
         Ok(Topics {
             session: Session::new(place.candidates()?),
@@ -291,8 +278,8 @@ impl Topics {
     /// Returns the reasons for the silence, each once. Empty if nothing is wrong.
     fn why_silent(&mut self) -> Vec<Silence> {
         let mut reasons = Vec::new();
-        for Followed { source, silence, .. } in &mut self.sources {
-            match source.why_silent(&mut self.session, silence) {
+        for Followed { source, .. } in &mut self.sources {
+            match source.why_silent(&mut self.session) {
                 Silence::Waiting => {}
                 // It is the reason for all of them.
                 reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
@@ -334,7 +321,6 @@ impl Follow for Topics {
         let Some((index, sample)) = self.look_and_receive()? else { return Ok(None) };
         if !sample.is_silence() {
             self.warn_at = None;
-            self.sources.iter_mut().for_each(|followed| followed.silence.end());
         }
         let followed = &mut self.sources[index];
         let header = sample.header().copied();
@@ -455,7 +441,7 @@ pub(crate) struct Verdicts {
     /// `None` after it has left.
     robot: Option<RobotSubscriber>,
     /// Takes the place of `robot` if the program polls.
-    pollable: Option<Pollable<RobotSubscriber>>,
+    pollable: Option<PollableSubscriber<Robot>>,
     wait: Option<Wait>,
 }
 
@@ -508,7 +494,7 @@ impl Follow for Verdicts {
     fn try_next(&mut self) -> Result<Option<Verdict>, Error> {
         self.wait = self.wait.or(Some(Wait::Doorbell));
         let Some(robot) = self.subscriber() else { return Ok(None) };
-        Ok(robot.try_next()?.map(verdict))
+        Ok(robot.try_next()?.as_ref().map(verdict))
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
@@ -543,13 +529,15 @@ impl Follow for Verdicts {
     }
 }
 
-fn builder(sensors: &[&str], place: &Place, early: bool) -> SubscriberBuilder<RobotSubscriber> {
-    let builder = RobotSubscriber::builder(sensors).domain(place.name());
-    let builder = if early { builder.early() } else { builder };
-    match &place.root {
-        Some(root) => builder.root(root),
-        None => builder,
+fn builder(sensors: &[&str], place: &Place, early: bool) -> SubscriberBuilder<Robot> {
+    let mut builder = RobotSubscriber::builder(sensors);
+    if let Some(domain) = &place.domain {
+        builder = builder.domain(domain);
     }
+    if let Some(root) = &place.root {
+        builder = builder.root(root);
+    }
+    if early { builder.early() } else { builder }
 }
 
 fn verdict(robot: &Robot) -> Verdict {

@@ -110,8 +110,11 @@ static void names_that_exist(void)
     MUST(scanhub_sensors(NULL, NULL, 1) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_topics("no/domain", buffer, sizeof buffer) == SCANHUB_REFUSED_CONFIGURATION);
     MUST(scanhub_open_robot(&robot, NULL, NULL, 0) == 0);
-    MUST(scanhub_why_silent(robot, &text) == SCANHUB_REFUSED_CONFIGURATION && text[0] == '\0');
-    SAYS("each of its sensors");
+    MUST(scanhub_why_silent(robot, &text) == SCANHUB_SILENCE_WAITING && text[0] != '\0');
+    struct scanhub_attachment *mistyped;
+    MUST(scanhub_open_robot(&mistyped, NULL, "frnot", 0) == 0);
+    MUST(scanhub_why_silent(mistyped, &text) == SCANHUB_SILENCE_UNKNOWN_SENSOR && strstr(text, "frnot") != NULL);
+    MUST(scanhub_close(mistyped) == 0);
     MUST(scanhub_close(robot) == 0);
 }
 

@@ -664,8 +664,8 @@ int scanhub_silent_for(struct scanhub_attachment *handle, uint64_t *silent_ns);
  * Returns the reason why no sample arrives, one of SCANHUB_SILENCE_.. . Never waits, and is cheap enough for once a
  * second. Sets *text, unless `text` is NULL, to a line with the reason, followed by a line with the remedy, except for
  * SCANHUB_SILENCE_WAITING. The text is valid until the next call of this function with this handle, or until
- * scanhub_close. A handle of scanhub_open_robot is refused with SCANHUB_REFUSED_CONFIGURATION, because each of its
- * sensors has its own reason.
+ * scanhub_close. A handle of scanhub_open_robot has the reason of its first sensor whose verdict is unknown and that has a
+ * reason.
  */
 int scanhub_why_silent(struct scanhub_attachment *handle, const char **text);
 
