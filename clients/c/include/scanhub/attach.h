@@ -38,17 +38,17 @@
 extern "C" {
 #endif
 
-/* Why a call was refused. */
+/* Reasons why a call was refused. */
 #define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
 #define SCANHUB_REFUSED_CONFIGURATION (-2) /* an invalid name, a descriptor without SCANHUB_WAIT_EVENT */
-#define SCANHUB_REFUSED_SHORT (-3)         /* shared memory, descriptors or places for consumers are short: try later */
+#define SCANHUB_REFUSED_SHORT (-3)         /* no memory, descriptors or places for subscribers are left: try later */
 #define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, a taken name, or another failure */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
-/* How scanhub_wait waits. */
-#define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
-#define SCANHUB_WAIT_EVENT 1    /* at a descriptor, which poll and epoll can wait at too: scanhub_fd */
-#define SCANHUB_WAIT_SPIN 2     /* not asleep: takes a whole processor for the shortest latency there is */
+/* Methods of scanhub_wait. */
+#define SCANHUB_WAIT_DOORBELL 0 /* on a word in the hub's memory; one call of the hub wakes all. The default choice */
+#define SCANHUB_WAIT_EVENT 1    /* on a descriptor, which poll and epoll accept, too: scanhub_fd */
+#define SCANHUB_WAIT_SPIN 2     /* without sleep: uses one CPU core completely for the shortest latency */
 
 /* Reasons why no sample arrives, from scanhub_why_silent. Later versions may have more. */
 #define SCANHUB_SILENCE_WAITING 0        /* nothing is wrong as far as the library knows, or the hub is starting */
@@ -575,16 +575,16 @@ struct scanhub_obstacles_v2 {
 /* A sensor of a robot. */
 struct scanhub_robot_sensor {
     const char *name;
-    uint8_t verdict;     /* unknown where it was not heard lately, or never */
-    uint32_t nearest_mm; /* from the robot's centre, of what it sees nearest; or SCANHUB_NOTHING_MM */
+    uint8_t verdict;     /* unknown if the sensor sent no recent data */
+    uint32_t nearest_mm; /* distance of its nearest point from the robot's center; or SCANHUB_NOTHING_MM */
 };
 
-/* What is known of a robot: the payload of scanhub_open_robot. All of it is lent with the sample. */
+/* Verdict of a robot: the payload of scanhub_open_robot. All of it is lent with the sample. */
 struct scanhub_robot {
     uint8_t verdict;     /* the worst of its sensors: stop, unknown, slow, clear; unknown as long as there are none */
     uint32_t nearest_mm; /* of all sensors; or SCANHUB_NOTHING_MM */
     const char *worst;   /* the first sensor with this verdict; NULL: there are none */
-    const char *nearest; /* the sensor that sees what is nearest; NULL: nobody does */
+    const char *nearest; /* the sensor that sees the nearest point; NULL: no sensor sees a point */
     size_t count;        /* of sensors */
     const struct scanhub_robot_sensor *sensors;
 };
@@ -608,16 +608,17 @@ struct scanhub_sample {
 int scanhub_open(struct scanhub_attachment **handle, const char *domain, const char *sensor, int topic, int wait);
 
 /*
- * Starts to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL: all sensors of
- * the hub; in a domain without a hub the sensors of other machines that are published there. scanhub_take then lends a struct
- * scanhub_robot (a copy without header): once every sensor has a verdict, whenever one gets a new verdict, and when one is
- * silent for too long, whose verdict then becomes unknown by itself. Everything else is as with scanhub_open.
+ * Starts to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL means all
+ * sensors of the hub. In a domain without a hub, it means the sensors of other machines that are published there.
+ * scanhub_take then lends a struct scanhub_robot (a copy without header): once every sensor has a verdict, whenever one gets
+ * a new verdict, and when one is silent for too long, whose verdict then becomes unknown by itself. Everything else is as
+ * with scanhub_open.
  */
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
- * The same, with early warnings (docs/early.md): the verdict becomes worse before a scan (a telegram or a turn) is complete,
- * and goes back if the warning is withdrawn.
+ * Like scanhub_open_robot, with early warnings (docs/early.md): the verdict becomes worse before a scan (a telegram or a
+ * turn) is complete, and goes back if the warning is withdrawn.
  */
 int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
@@ -631,27 +632,27 @@ int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *dom
 int scanhub_fd(struct scanhub_attachment *handle);
 
 /*
- * Sleeps until there is a sample to take: 1; or until `timeout_ms` are over: 0. Negative: waits without limit. A signal whose
+ * Sleeps until a sample has arrived: 1; or until `timeout_ms` have passed: 0. Negative: waits without limit. A signal whose
  * handler returns does not end the wait: choose a timeout within which your program must see the handler's flag.
  */
 int scanhub_wait(struct scanhub_attachment *handle, int timeout_ms);
 
 /*
- * Lends the next sample: 1; or there is none: 0, and *sample is empty. Never waits. Four samples can be lent at a time; what
- * a sample points to lives until it is released.
+ * Lends the next sample: 1; or there is none: 0, and *sample is empty. Never waits. Four samples can be lent at a time. The
+ * memory that a sample points to is valid until it is released.
  *
  * Of zones it is the latest one, as a copy. When that becomes too old, because sensor, hub or machine stopped, there is one
  * more sample, without header, whose verdict is unknown (`stale`). A program that acts on zones needs no clock of its own.
  */
 int scanhub_take(struct scanhub_attachment *handle, struct scanhub_sample *sample);
 
-/* Returns a sample and empties it: 0, also if it is empty. A refused sample stays as it is. */
+/* Returns a sample and empties it: 0, even if it is empty. A refused sample stays as it is. */
 int scanhub_release(struct scanhub_sample *sample);
 
 /* Closes the handle; its lent samples become invalid too: 0, also for NULL. */
 int scanhub_close(struct scanhub_attachment *handle);
 
-/* 1 if a hub lives in the domain, 0 if not, as of the last call that found no sample. */
+/* 1 if a hub runs in the domain, 0 if not, as of the last call that found no sample. */
 int scanhub_hub_lives(struct scanhub_attachment *handle);
 
 /*
@@ -689,12 +690,12 @@ int scanhub_topics(const char *domain, char *names, size_t size);
 int scanhub_publish_tilt(struct scanhub_publication **publication, const char *domain, const char *name);
 
 /*
- * Says that the mount was at `angle_rad`, right-handed around its axis, at `stamp_ns` of CLOCK_MONOTONIC (0: now), and how fast
- * the angle grew (NAN: not known). Wakes who follows it, and waits for nobody: 0.
+ * Publishes that the mount was at `angle_rad`, right-handed around its axis, at `stamp_ns` of CLOCK_MONOTONIC (0: now), and
+ * how fast the angle grew (NAN: not known). Wakes the subscribers, and never waits: 0.
  */
 int scanhub_send_tilt(struct scanhub_publication *publication, uint64_t stamp_ns, double angle_rad, double rate_rad_s);
 
-/* Ends it and gives the name free: 0, also for NULL. The end of the thread or of the process does the same. */
+/* Ends the publication and releases the name: 0, even for NULL. The end of the thread or of the process does the same. */
 int scanhub_unpublish(struct scanhub_publication *publication);
 
 /* The message of this thread's last refused call: a line, and often a second one with the remedy. Valid until the next. */
@@ -741,7 +742,7 @@ static inline unsigned scanhub_count(const struct scanhub_sample *scan)
     return head->count < room ? head->count : (unsigned)room;
 }
 
-/* Where the array behind those of `before` begins. */
+/* The array that follows those of `before`. */
 static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, unsigned before)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -751,13 +752,13 @@ static inline const void *scanhub_scan_array(const struct scanhub_sample *scan, 
     return (const unsigned char *)scan->payload + sizeof *head + offset;
 }
 
-/* The ranges in device units, scanhub_count of them, for who reads many: those above `valid_to` are codes, which are no ranges. */
+/* The ranges in device units, scanhub_count of them, for programs that read many. Values above `valid_to` are codes. */
 static inline const uint16_t *scanhub_ranges(const struct scanhub_sample *scan)
 {
     return (const uint16_t *)scanhub_scan_array(scan, SCANHUB_SCAN_ANGLES);
 }
 
-/* The range of beam i in metres; NAN if it has no reading, whatever the reason. */
+/* The range of beam i in meters; NAN if it has no reading, whatever the reason. */
 static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned i)
 {
     if (i >= scanhub_count(scan))
@@ -782,13 +783,13 @@ static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i
 }
 
 /*
- * Why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near", "too_bright", "weak",
+ * The reason why beam i has no reading: "not_measured", "no_return", "beyond" the range limit, "too_near", "too_bright", "weak",
  * "overflow", "error"; NULL if it has one, or does not exist.
  */
 static inline const char *scanhub_code(const struct scanhub_sample *scan, unsigned i)
 {
     static const char *const words[] = {"not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error"};
-    /* Those of an LMS, from the greatest value of its measuring mode down. */
+    /* Codes of an LMS, from the maximum value of its measuring mode down. */
     static const unsigned char lms[] = {1, 4, 6, 6, 5, 7, 6, 6, 2};
     if (i >= scanhub_count(scan))
         return NULL;
@@ -821,14 +822,14 @@ static inline unsigned scanhub_collapsed(const struct scanhub_sample *scan)
     return head == NULL ? 0 : head->collapsed;
 }
 
-/* 1: packets of the turn are missing; what was in them is not measured. */
+/* 1: packets of the turn are missing. Their points are not measured. */
 static inline int scanhub_is_incomplete(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
     return head != NULL && (head->flags & 1) != 0;
 }
 
-/* When beam i was measured, in ns of CLOCK_MONOTONIC; 0 for a sample that is none. */
+/* The time at which beam i was measured, in ns of CLOCK_MONOTONIC; 0 for a sample that is none. */
 static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
