@@ -1,8 +1,13 @@
-//! Stores the commit that the module is built from, so that the tests can detect a module of another commit.
+//! Stores the commit that the module is built from, and the hash of its sources, so that the tests can detect a module
+//! of other sources.
 
+mod sources;
+
+use std::io;
+use std::path::Path;
 use std::process::Command;
 
-fn main() {
+fn main() -> io::Result<()> {
     let git = |words: &[&str]| {
         let output =
             Command::new("git").args(words).output().ok().filter(|output| output.status.success())?;
@@ -10,8 +15,13 @@ fn main() {
     };
     let commit = git(&["rev-parse", "HEAD"]).unwrap_or_else(|| "unknown".to_owned());
     println!("cargo:rustc-env=SCANHUB_COMMIT={commit}");
-    println!("cargo:rerun-if-changed=build.rs");
     for path in ["HEAD", "logs/HEAD"].into_iter().filter_map(|path| git(&["rev-parse", "--git-path", path])) {
         println!("cargo:rerun-if-changed={path}");
     }
+    let root = Path::new("../..");
+    let packages = sources::packages(root)?;
+    println!("cargo:rustc-env=SCANHUB_SOURCES={}", sources::hash(root, &packages)?);
+    println!("cargo:rerun-if-changed=../../Cargo.toml");
+    packages.iter().for_each(|package| println!("cargo:rerun-if-changed=../../{package}"));
+    Ok(())
 }

@@ -7,6 +7,9 @@ use std::sync::OnceLock;
 use super::child::succeeds;
 use super::{output, skip};
 
+#[path = "../../clients/python/sources.rs"]
+mod sources;
+
 /// Returns a command that starts a Python with `modules`: that of `SCANHUB_PYTHON`, or the one that `.ci/run`
 /// installs. If there is none, skips the test and returns `None`.
 pub(crate) fn python(modules: &str) -> Option<Command> {
@@ -27,26 +30,21 @@ pub(crate) fn python_for(need: &str, modules: &str) -> Option<Command> {
     Some(command)
 }
 
-/// Returns a command that starts a Python with the package `scanhub` of this version and commit. If there is none, skips the
-/// test and returns `None`.
+/// Returns a command that starts a Python with the package `scanhub` that was built from these sources. If there is none,
+/// skips the test and returns `None`.
 pub(crate) fn client_python() -> Option<Command> {
-    static FOUND: OnceLock<String> = OnceLock::new();
+    static FOUND: OnceLock<(String, String)> = OnceLock::new();
     let command = python_for("python-packages", "numpy")?;
-    let found = FOUND.get_or_init(|| {
+    let (found, expected) = FOUND.get_or_init(|| {
         let mut ask = Command::new(command.get_program());
-        ask.args(["-B", "-c", "import scanhub; print(scanhub.__version__, scanhub.__commit__)"]);
-        text(ask)
+        ask.args(["-B", "-c", "import scanhub; print(scanhub._scanhub._sources)"]);
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let expected = sources::packages(root).and_then(|packages| sources::hash(root, &packages));
+        (text(ask), expected.expect("the sources are readable"))
     });
-    let mut git = Command::new("git");
-    let commit = text({
-        git.args(["rev-parse", "HEAD"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-        git
-    });
-    let commit = if commit.is_empty() { "unknown" } else { &commit };
-    let expected = format!("{} {commit}", env!("CARGO_PKG_VERSION"));
-    if *found != expected {
+    if found != expected {
         let python = command.get_program().display();
-        let what = format!("{python} has the package {found:?} in place of {expected:?}");
+        let what = format!("{python} has no package scanhub of these sources");
         skip("python-packages", format!("{what}: clients/python/build.sh makes it"));
         return None;
     }

@@ -33,6 +33,8 @@ fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.py().import("numpy")?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
     module.add("__commit__", env!("SCANHUB_COMMIT"))?;
+    // For tests, and not a name that the module exports.
+    module.setattr("_sources", env!("SCANHUB_SOURCES"))?;
     module.add_class::<Sample>()?;
     topics::add_to(module)?;
     module.add_class::<subscription::Subscription>()?;
