@@ -5,6 +5,7 @@
 //! mutex.
 #![allow(unsafe_code)]
 
+use std::collections::VecDeque;
 use std::mem;
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::PathBuf;
@@ -16,7 +17,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Change, Sample as AnySample, Session, Source, find};
 use scanhub_client::{
-    Domain, ErrorKind, Header, PollableSubscriber, Publication, Robot, RobotSubscriber, Silence,
+    Domain, ErrorKind, Header, PollableSubscriber, Publication, Robot, RobotSubscriber, Silence, Subscriber,
     SubscriberBuilder, Tilt, Topic, Wait, domain_candidates,
 };
 use scanhub_schema::Failure;
@@ -140,7 +141,7 @@ pub(crate) trait Follow: Sized + Send {
     /// Received item.
     type Item;
 
-    /// Returns the next item that has arrived.
+    /// Returns the next item that has arrived. `None` while there are notices.
     fn try_next(&mut self) -> Result<Option<Self::Item>, Error>;
 
     /// Sleeps until an item may have arrived, at most for `longest` and 0.1 s.
@@ -161,19 +162,31 @@ pub(crate) trait Follow: Sized + Send {
     /// Returns the time since the last sample; if there was none, since the start. Time in suspend counts.
     fn silent_for(&self) -> Duration;
 
-    /// Returns the changes of the hub since the last call, oldest first.
-    fn notices(&mut self) -> Vec<&'static str> {
-        Vec::new()
+    /// Takes the oldest change of the hub that was not taken yet.
+    fn next_notice(&mut self) -> Option<&'static str> {
+        None
     }
 
+    /// Returns the time of the next check for a warning. `None` after the warning, and if there is nothing to warn of.
+    fn warn_at(&mut self) -> &mut Option<Instant>;
+
+    /// Returns the reasons for the silence, each once. Empty if nothing is wrong.
+    fn why_silent(&mut self) -> Vec<Silence>;
+
     /// Returns the time until [`warning`](Self::warning) must be called, if it may return something.
-    fn warning_due(&self) -> Option<Duration> {
-        None
+    fn warning_due(&mut self) -> Option<Duration> {
+        self.warn_at().map(|at| at.saturating_duration_since(Instant::now()))
     }
 
     /// Returns the reason why nothing was received, once and after [`WARN_AFTER`].
     fn warning(&mut self) -> Option<Error> {
-        None
+        let now = Instant::now();
+        self.warn_at().take_if(|at| *at <= now)?;
+        let reason = Error::of_silence(&self.why_silent());
+        if reason.is_none() {
+            *self.warn_at() = Some(now + CHECK_INTERVAL);
+        }
+        reason
     }
 
     /// Returns the error after a silence of `timeout` seconds.
@@ -191,7 +204,7 @@ pub(crate) struct Topics {
     wait: Option<Wait>,
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
-    notices: Vec<&'static str>,
+    notices: VecDeque<&'static str>,
     /// Time of the next check for a warning; `None` before the first look, and after the first sample or the warning.
     warn_at: Option<Instant>,
     has_left: bool,
@@ -216,7 +229,7 @@ impl Topics {
             turn: 0,
             wait: None,
             descriptor: None,
-            notices: Vec::new(),
+            notices: VecDeque::new(),
             warn_at: None,
             has_left: false,
         })
@@ -224,6 +237,10 @@ impl Topics {
 
     fn look_and_receive(&mut self) -> Result<Option<(usize, AnySample)>, Error> {
         loop {
+            // A callback that fails must not lose a sample, so the program gets the notices first.
+            if !self.notices.is_empty() {
+                return Ok(None);
+            }
             // Samples that have arrived come first, because a look for the hub takes longer than receiving.
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
@@ -236,6 +253,9 @@ impl Topics {
                 if error.kind() == ErrorKind::OtherUser {
                     return Err(error.into());
                 }
+            }
+            if !self.notices.is_empty() {
+                continue;
             }
             if let Some(received) = self.receive(false)? {
                 return Ok(Some(received));
@@ -273,21 +293,6 @@ impl Topics {
             }
         }
         Ok(None)
-    }
-
-    /// Returns the reasons for the silence, each once. Empty if nothing is wrong.
-    fn why_silent(&mut self) -> Vec<Silence> {
-        let mut reasons = Vec::new();
-        for Followed { source, .. } in &mut self.sources {
-            match source.why_silent(&mut self.session) {
-                Silence::Waiting => {}
-                // It is the reason for all of them.
-                reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
-                reason if reasons.contains(&reason) => {}
-                reason => reasons.push(reason),
-            }
-        }
-        reasons
     }
 
     /// Sets the method of waiting with the first look.
@@ -366,26 +371,30 @@ impl Follow for Topics {
         self.session.domain().is_some()
     }
 
-    fn notices(&mut self) -> Vec<&'static str> {
-        mem::take(&mut self.notices)
+    fn next_notice(&mut self) -> Option<&'static str> {
+        self.notices.pop_front()
     }
 
     fn silent_for(&self) -> Duration {
         self.session.silent_for()
     }
 
-    fn warning_due(&self) -> Option<Duration> {
-        self.warn_at.map(|at| at.saturating_duration_since(Instant::now()))
+    fn warn_at(&mut self) -> &mut Option<Instant> {
+        &mut self.warn_at
     }
 
-    fn warning(&mut self) -> Option<Error> {
-        let now = Instant::now();
-        self.warn_at.take_if(|at| *at <= now)?;
-        let reason = Error::of_silence(&self.why_silent());
-        if reason.is_none() {
-            self.warn_at = Some(now + CHECK_INTERVAL);
+    fn why_silent(&mut self) -> Vec<Silence> {
+        let mut reasons = Vec::new();
+        for Followed { source, .. } in &mut self.sources {
+            match source.why_silent(&mut self.session) {
+                Silence::Waiting => {}
+                // It is the reason for all of them.
+                reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
+                reason if reasons.contains(&reason) => {}
+                reason => reasons.push(reason),
+            }
         }
-        reason
+        reasons
     }
 
     fn silence(&mut self, timeout: f64) -> Error {
@@ -443,6 +452,8 @@ pub(crate) struct Verdicts {
     /// Takes the place of `robot` if the program polls.
     pollable: Option<PollableSubscriber<Robot>>,
     wait: Option<Wait>,
+    /// Time of the next check for a warning; `None` after the warning, and after a verdict other than unknown.
+    warn_at: Option<Instant>,
 }
 
 /// Verdict of a robot, by value.
@@ -464,12 +475,20 @@ impl Verdicts {
     pub(crate) fn new(sensors: &[&str], place: &Place, early: bool) -> Result<Verdicts, Error> {
         let robot = Some(builder(sensors, place, early).open()?);
         let sensors = sensors.iter().map(|&sensor| sensor.to_owned()).collect();
-        Ok(Verdicts { sensors, place: place.clone(), early, robot, pollable: None, wait: None })
+        let (place, warn_at) = (place.clone(), Some(Instant::now() + WARN_AFTER));
+        Ok(Verdicts { sensors, place, early, robot, pollable: None, wait: None, warn_at })
     }
 
     /// Returns what is known now. Never waits.
     pub(crate) fn now(&mut self) -> Result<Verdict, Error> {
-        self.subscriber().map_or(Ok(Verdict::default()), |robot| Ok(verdict(robot.now()?)))
+        let Some(robot) = self.subscriber() else { return Ok(Verdict::default()) };
+        let verdict = verdict(robot.now()?);
+        self.note(&verdict);
+        Ok(verdict)
+    }
+
+    fn note(&mut self, verdict: &Verdict) {
+        self.warn_at.take_if(|_| verdict.verdict != scanhub_client::Verdict::Unknown.name());
     }
 
     fn subscriber(&mut self) -> Option<&mut RobotSubscriber> {
@@ -494,7 +513,9 @@ impl Follow for Verdicts {
     fn try_next(&mut self) -> Result<Option<Verdict>, Error> {
         self.wait = self.wait.or(Some(Wait::Doorbell));
         let Some(robot) = self.subscriber() else { return Ok(None) };
-        Ok(robot.try_next()?.as_ref().map(verdict))
+        let verdict = robot.try_next()?.as_ref().map(verdict);
+        verdict.iter().for_each(|verdict| self.note(verdict));
+        Ok(verdict)
     }
 
     fn wait(&mut self, longest: Duration) -> Result<(), Error> {
@@ -526,6 +547,15 @@ impl Follow for Verdicts {
             Some(pollable) => pollable.silent_for(),
             None => self.robot.as_ref().map(RobotSubscriber::silent_for).unwrap_or_default(),
         }
+    }
+
+    fn warn_at(&mut self) -> &mut Option<Instant> {
+        &mut self.warn_at
+    }
+
+    fn why_silent(&mut self) -> Vec<Silence> {
+        let reason = self.subscriber().map(Subscriber::why_silent);
+        reason.filter(|reason| *reason != Silence::Waiting).into_iter().collect()
     }
 }
 

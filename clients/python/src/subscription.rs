@@ -12,7 +12,7 @@ use crate::error::{Error, value};
 use crate::{parse, topics};
 
 /// Returns the next item, after a wait if none has arrived. `None` if the subscription is closed.
-fn next<F: Follow<Item: Send> + 'static>(
+fn next<F: Follow>(
     py: Python<'_>,
     this: &Arc<Confined<F>>,
     timeout: Option<f64>,
@@ -23,8 +23,8 @@ fn next<F: Follow<Item: Send> + 'static>(
         // A timeout that is too long for the clock is none.
         Instant::now().checked_add(Duration::try_from_secs_f64(seconds.max(0.0)).ok()?)
     });
-    let mut item = poll(py, this, notice)?;
     loop {
+        let item = poll(py, this, notice)?;
         if item.is_some() || !is_open(this) {
             return Ok(item);
         }
@@ -32,20 +32,12 @@ fn next<F: Follow<Item: Send> + 'static>(
         if left.is_zero() {
             return Err(silence(this, timeout).into());
         }
-        let waited = py.detach(|| {
-            this.with(|follower| follower.wait(left)).transpose()?;
-            Ok::<_, Error>(this.with(F::try_next).transpose()?.flatten())
-        });
-        item = waited?;
-        notify(py, this, notice)?;
-        if item.is_none() {
-            py.check_signals()?;
-            warn(py, this)?;
-        }
+        py.detach(|| this.with(|follower| follower.wait(left)).transpose())?;
+        py.check_signals()?;
     }
 }
 
-/// Returns the next item that has arrived.
+/// Returns the next item that has arrived, after the notices before it.
 fn poll<F: Follow>(
     py: Python<'_>,
     this: &Arc<Confined<F>>,
@@ -54,18 +46,30 @@ fn poll<F: Follow>(
     if !is_open(this) {
         return Ok(None);
     }
-    let item = this.with(F::try_next).transpose()?.flatten();
-    notify(py, this, notice)?;
-    if item.is_none() {
-        warn(py, this)?;
+    loop {
+        let item = this.with(F::try_next).transpose()?.flatten();
+        if item.is_some() {
+            return Ok(item);
+        }
+        if !notify(py, this, notice)? {
+            warn(py, this)?;
+            return Ok(None);
+        }
     }
-    Ok(item)
 }
 
-fn notify<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>, notice: Option<&Py<PyAny>>) -> PyResult<()> {
-    let Some(call) = notice else { return Ok(()) };
-    let notices = this.with(Follow::notices).unwrap_or_default();
-    notices.into_iter().try_for_each(|notice| call.call1(py, (notice,)).map(drop))
+/// Calls the program with each notice. Returns whether there was one. If the call fails, the others stay.
+fn notify<F: Follow>(
+    py: Python<'_>,
+    this: &Arc<Confined<F>>,
+    callback: Option<&Py<PyAny>>,
+) -> PyResult<bool> {
+    let mut any = false;
+    while let Some(notice) = this.with(Follow::next_notice).flatten() {
+        callback.map_or(Ok(()), |callback| callback.call1(py, (notice,)).map(drop))?;
+        any = true;
+    }
+    Ok(any)
 }
 
 fn warn<F: Follow>(py: Python<'_>, this: &Arc<Confined<F>>) -> PyResult<()> {
@@ -219,6 +223,7 @@ follower! {
     fn now(&self, py: Python<'_>) -> PyResult<Py<PyAny>> {
         let _reserved = self.source.reserve()?;
         let verdict = self.source.with(Verdicts::now).transpose()?;
+        warn(py, &self.source)?;
         robot(py, verdict.unwrap_or_default())
     }
 }

@@ -106,19 +106,46 @@ def reasons_of_a_silence() -> None:
     os.close(lock)
 
 
-def warnings_in_asyncio() -> None:
-    async def follow() -> None:
-        with scanhub.subscribe("front/scan", domain="nowhere", root=root) as silent:
-            await silent.__anext__()
-
+def warning(what) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("error", scanhub.SilenceWarning)
         try:
-            asyncio.run(asyncio.wait_for(follow(), 20))
+            what()
         except scanhub.SilenceWarning as warning:
-            assert "scanhub run" in str(warning), warning
-        else:
-            raise AssertionError("nothing can be received")
+            return str(warning)
+    raise AssertionError("nothing can be received")
+
+
+def warnings_in_asyncio() -> None:
+    async def follow(silent: "scanhub.Subscription | scanhub.RobotFollower") -> None:
+        with silent:
+            async for _ in silent:
+                pass
+
+    for ask in (lambda **place: scanhub.subscribe("front/scan", **place), scanhub.robot):
+        silent = ask(domain="nowhere", root=root)
+        said = warning(lambda: asyncio.run(asyncio.wait_for(follow(silent), 20)))
+        assert "scanhub run" in said, said
+
+
+def warnings_of_a_robot() -> None:
+    def follow() -> None:
+        for now in silent:
+            assert now.verdict == "unknown"
+
+    def ask() -> None:
+        give_up_at = time.monotonic() + 20
+        while time.monotonic() < give_up_at:
+            assert silent.now().verdict == "unknown"
+            time.sleep(0.01)
+
+    lock = hub_without_topics()
+    with publish("other"):
+        for what in (follow, ask):
+            silent = scanhub.robot("othr", domain=domain, root=root)
+            said = warning(what)
+            assert "no sensor othr" in said and "the sensors are other" in said, said
+    os.close(lock)
 
 
 def duration_of_a_silence() -> None:
@@ -180,6 +207,7 @@ for check in (
     silence,
     reasons_of_a_silence,
     warnings_in_asyncio,
+    warnings_of_a_robot,
     duration_of_a_silence,
     what_is_short,
 ):

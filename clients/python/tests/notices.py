@@ -1,0 +1,33 @@
+"""A callback that fails at the end of the hub: arguments are domain and root. `front` publishes its status, and its hub ends
+when this has printed a line. It reads a line before and after that."""
+
+import select
+import sys
+import time
+
+import scanhub
+
+
+def notice(kind: str) -> None:
+    notices.append(kind)
+    if kind == "hub_gone":
+        raise KeyError(kind)
+
+
+domain, root = sys.argv[1:]
+notices: "list[str]" = []
+statuses = scanhub.subscribe("front/status", domain=domain, root=root, timeout=20, on_notice=notice)
+while not select.select([sys.stdin], [], [], 0.05)[0]:
+    assert statuses._poll() is None
+sys.stdin.readline()
+print('{"class": "waits"}', flush=True)
+sys.stdin.readline()
+# Now the subscription asks whether its hub runs.
+time.sleep(1.2)
+try:
+    next(statuses)
+    raise AssertionError("the callback failed")
+except KeyError:
+    pass
+assert next(statuses).topic_seq == 7
+assert notices == ["hub_back", "hub_gone"], notices
