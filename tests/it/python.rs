@@ -1,5 +1,5 @@
 //! The Python package next to a hub. Scripts check what only Python can see, and the tests compare the samples that they follow
-//! with those of `echo`. The tests skip if there is no Python with the package of this commit.
+//! with those of `echo`. The tests skip if there is no Python with a package of these sources.
 
 mod read;
 
@@ -12,7 +12,9 @@ use crate::testkit::{
     INT, KILL, Outcome, Program, Sender, TERM, TestEnv, client_python, in_a_network, is_class, number,
     output, python, skip, until,
 };
-use scanhub_schema::{Topic, Verdict, Zones};
+use scanhub_schema::limits::TopicLimits;
+use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
+use scanhub_shm::{HubLock, Node, Payload, PortFactory, Waker};
 use serde_json::{Value, json};
 
 /// A script of the package's tests, if there is a Python for it.
@@ -64,6 +66,50 @@ fn what_cannot_be_followed_is_told_in_words() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "refusals") else { return };
     passed(command);
+}
+
+/// Starts a hub of `front` without a link. The test creates its topics.
+fn bare_hub(env: &TestEnv) -> (HubLock, Node, Waker) {
+    let lock = HubLock::acquire(env.place().root()).expect("no hub runs");
+    let node = scanhub_shm::hub_node(&env.place()).expect("a node");
+    let waker = Waker::new(&node, "front").expect("memory");
+    (lock, node, waker)
+}
+
+#[test]
+fn hub_with_another_layout_is_a_mismatch() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "mismatch") else { return };
+    let (lock, node, _waker) = bare_hub(&env);
+    let service = Topic::Scan.service("front").as_str().try_into().expect("a name");
+    let _scan = node.service_builder(&service).publish_subscribe::<u64>().create().expect("a service");
+    lock.report_ready().expect("the lock is open");
+    passed(command);
+}
+
+#[test]
+fn notice_that_raises_loses_no_sample() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "notices") else { return };
+    let (lock, node, _waker) = bare_hub(&env);
+    let limits = TopicLimits::default();
+    let service = Status::create(&node, "front", &limits).expect("a service");
+    let publisher = Status::publisher(&service, &limits).expect("a publisher");
+    lock.report_ready().expect("the lock is open");
+    let (stdin, mut lines) = std::io::pipe().expect("a pipe");
+    let mut script = Program::start_with(command, stdin);
+    until("the subscriber", || service.dynamic_config().number_of_subscribers() == 1);
+    lines.write_all(b"\n").expect("it reads");
+    script.await_line("it waits", is_class("waits"));
+    // The sample wakes no subscriber. So the look that notices the end of the hub also finds the sample.
+    let mut sample = publisher.loan().expect("memory");
+    *sample.user_header_mut() = Header { topic_seq: 7, ..Header::default() };
+    *sample.payload_mut() = Status::default();
+    sample.send().expect("a connection");
+    drop(lock);
+    lines.write_all(b"\n").expect("it reads");
+    let outcome = script.wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
 }
 
 #[test]

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from typing import Any
+from typing import Any, Callable
 
 import numpy as np
 import scanhub
@@ -40,6 +40,17 @@ def refuses(error: type, what) -> str:
     except error as refused:
         return str(refused)
     raise AssertionError(f"{error} was not raised")
+
+
+def subscribe(*topics: str, timeout: float = 20.0, **options: Any) -> scanhub.Subscription:
+    return scanhub.subscribe(*topics, domain=domain, root=root, timeout=timeout, **options)
+
+
+def until(is_done: Callable[[], bool]) -> None:
+    give_up_at = time.monotonic() + 60
+    while not is_done():
+        assert time.monotonic() < give_up_at
+        time.sleep(0.01)
 
 
 def views_are_the_hubs_memory(scans: scanhub.Subscription) -> None:
@@ -148,44 +159,53 @@ def other_threads_drop_samples(scans: scanhub.Subscription) -> None:
         kept.clear()
 
 
-def a_sample_is_dropped_while_another_thread_waits(scans: scanhub.Subscription) -> None:
-    with scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20) as own:
-        kept = [next(own) for _ in range(4)]
-        held = []
+def a_sample_is_dropped_while_another_thread_waits(_: scanhub.Subscription) -> None:
+    def has_subscriber() -> bool:
+        assert tilts._poll() is None
+        return mount.subscribers == 1
 
-        def take() -> None:
-            try:
-                next(own)
-            except scanhub.Held:
-                held.append(True)
+    with scanhub.publish("mount/tilt", domain=domain, root=root) as mount, subscribe("mount/tilt") as tilts:
+        until(has_subscriber)
 
-        thread = threading.Thread(target=take)
+        def sent(angle_rad: float) -> scanhub.Tilt:
+            mount.send(angle_rad)
+            return next(tilts)
+
+        kept = [sent(angle_rad) for angle_rad in (0.0, 1.0, 2.0, 3.0)]
+        received: list[float] = []
+        thread = threading.Thread(target=lambda: received.append(next(tilts).angle_rad))
         thread.start()
+        # The call reserves the subscription as `next` does, and holds the lock of the interpreter.
+        until(lambda: "another thread" in refuses(scanhub.Failure, tilts._descriptor))
         kept.clear()
+        mount.send(4.0)
         thread.join()
-        next(own)
+        assert received == [4.0], received
+        kept = [sent(angle_rad) for angle_rad in (5.0, 6.0, 7.0, 8.0)]
 
 
 def two_threads_at_a_time_are_refused(scans: scanhub.Subscription) -> None:
-    nothing = scanhub.subscribe("nobody/scan", domain=domain, root=root, timeout=1)
-    begun = threading.Event()
+    waits, may_continue, refused = threading.Event(), threading.Event(), []
 
-    def wait() -> None:
-        begun.set()
-        refuses(scanhub.Silent, lambda: next(nothing))
+    def notice(_: str) -> None:
+        waits.set()
+        may_continue.wait()
 
-    thread = threading.Thread(target=wait)
+    # `next` calls `notice`, because it finds the hub, and then waits.
+    nothing = subscribe("nobody/scan", timeout=0.1, on_notice=notice)
+    thread = threading.Thread(target=lambda: refused.append(refuses(scanhub.Silent, lambda: next(nothing))))
     thread.start()
-    begun.wait()
-    time.sleep(0.2)
+    waits.wait()
     said = refuses(scanhub.Failure, lambda: next(nothing))
-    assert "another thread" in said, said
+    may_continue.set()
     thread.join()
+    assert "another thread" in said and "nobody" in refused[0], (said, refused)
     # One after the other may use it.
     next(scans)
-    thread = threading.Thread(target=lambda: next(scans))
+    thread = threading.Thread(target=lambda: refused.append(next(scans).sensor))
     thread.start()
     thread.join()
+    assert refused[1:] == ["front"], refused
 
 
 def ctrl_c_ends_a_wait(_: scanhub.Subscription) -> None:
@@ -319,5 +339,5 @@ for check in (
     a_child_of_multiprocessing_takes_nothing,
     a_child_is_refused,
 ):
-    check(scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20))
+    check(subscribe("front/scan"))
     print(check.__name__, flush=True)
