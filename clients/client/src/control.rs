@@ -30,12 +30,13 @@ use crate::presence::{GRACE, find};
 ///
 /// # Errors
 ///
-/// [`ErrorKind::NoHub`](crate::ErrorKind) within a second if there is none, or if it ends before it answers;
-/// [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors that exist;
-/// [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time;
-/// [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it; [`ErrorKind::Timeout`](crate::ErrorKind) if the
-/// hub does not answer: it is short of something, or the link is busy; [`ErrorKind::Interrupted`](crate::ErrorKind) if
-/// `stop` is set.
+/// - [`ErrorKind::NoHub`](crate::ErrorKind) within a second if no hub runs, or if it ends before it answers.
+/// - [`ErrorKind::NoTopic`](crate::ErrorKind) with the sensors that exist.
+/// - [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if there are too many requests at a time.
+/// - [`ErrorKind::Failed`](crate::ErrorKind) if the link cannot do it.
+/// - [`ErrorKind::Timeout`](crate::ErrorKind) if the hub does not answer, because it lacks memory or descriptors, or
+///   because the link is busy.
+/// - [`ErrorKind::Interrupted`](crate::ErrorKind) if `stop` is set.
 pub fn request(places: &[Domain], request: &Request, stop: &AtomicBool) -> Result<Option<Shown>, Error> {
     let domain = find(places)?;
     let node = scanhub_shm::client_node(&domain)?;
@@ -66,7 +67,7 @@ fn ask(
     let give_up_at = Instant::now() + PATIENCE;
     loop {
         scanhub_shm::take_wakeups(&[client.responses()])?;
-        // In this order: what was answered before the hub went is an answer.
+        // In this order, because a hub may exit just after its answer.
         let lives = pending.is_open() && holder(domain.root())?.is_some();
         if let Some(response) = pending.response()? {
             return Ok(response.0?);
@@ -91,9 +92,9 @@ fn ask(
     }
 }
 
-/// A link takes a request within milliseconds; one that opens its port may need longer.
+/// Time limit of an answer. A link takes a request within milliseconds; one that opens its port may need longer.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How often the hub's life and the wish to stop are looked at.
+/// Interval of the checks for the hub and for the request to stop.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// How often a service that is not there is asked for.
+/// Interval of the attempts to open a service that does not exist yet.
 const ASK_AGAIN: Duration = Duration::from_millis(10);

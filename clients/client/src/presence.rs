@@ -33,7 +33,7 @@ pub(crate) struct Presence {
     denied: Option<Failure>,
 }
 
-/// Who publishes in a domain. If both run, the hub counts.
+/// Publisher in a domain. If both run, the hub counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Who {
     /// A hub.
@@ -49,12 +49,12 @@ struct Holder {
     who: Who,
 }
 
-/// What changed since the last look. Both: one was replaced in between.
+/// Change since the last look. If both are set, one publisher has replaced another one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Change {
-    /// The publisher that is not there any more.
+    /// The publisher that has ended.
     pub gone: Option<Who>,
-    /// The publisher that was not there before.
+    /// The publisher that has started.
     pub back: Option<Who>,
 }
 
@@ -255,7 +255,7 @@ pub fn find(places: &[Domain]) -> Result<Domain, Error> {
     }
 }
 
-/// How long a hub that is starting may take to become visible: a verb without a hub ends within a second.
+/// Time within which a hub that is starting becomes visible. A verb without a hub ends within a second.
 pub const GRACE: Duration = Duration::from_millis(500);
 
 /// Returns the sensors of the hub at the first live one of `places`. Returns none in place of an error, and never

@@ -21,7 +21,7 @@ type Node = scanhub_shm::Node<ThreadSafeService>;
 type Waker = scanhub_shm::Waker<ThreadSafeService>;
 
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names. Programs follow it by
-/// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
+/// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener runs; publishing needs neither.
 ///
 /// Which names are possible depends on the topic. A topic that no hub publishes, such as people or the angles of a
 /// mount, has a name without a dot, such as `mount`. Any number of programs publish this way, each under another name.
@@ -32,7 +32,7 @@ type Waker = scanhub_shm::Waker<ThreadSafeService>;
 ///
 /// # Errors
 ///
-/// Those of [`PublishSession::beside`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
+/// Returns the errors of [`PublishSession::beside`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
 /// [`SensorPublisher::topic`].
 ///
 /// # Examples
@@ -157,7 +157,7 @@ impl PublishSession {
         &self.0.limits
     }
 
-    /// Checks that there is memory for `topics` of one sensor, and descriptors for their first consumers.
+    /// Checks that there is memory for `topics` of one sensor, and descriptors for their first subscribers.
     ///
     /// # Errors
     ///
@@ -230,7 +230,7 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// As [`topic`](Self::topic).
+    /// Returns the errors of [`topic`](Self::topic).
     pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Error> {
         let Membership { domain, node, .. } = &*self.0.membership;
         if P::TOPIC.maker() == Maker::Link && !is_remote(&self.0.name) {
@@ -285,7 +285,7 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`publish`](crate::publish).
+    /// Returns the errors of [`publish`](crate::publish).
     pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Error> {
         let (topics, limits) = ([P::TOPIC], TopicLimits::default());
         if P::TOPIC.maker() == Maker::Link {
@@ -358,8 +358,8 @@ impl<P: Payload + ?Sized> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if it is longer than the
-    /// topic was made for.
+    /// Returns the errors of [`send`](Publication::send), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) if the
+    /// sample is longer than the limit of the topic.
     pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header();
         self.send_len_with(&header, len, fill)?;
@@ -403,7 +403,7 @@ impl<P: Payload> Publication<P> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Self::send).
+    /// Returns the errors of [`send`](Self::send).
     pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Error> {
         let header = self.header_at(stamp_ns);
         self.send_with(&header, fill)?;
@@ -429,8 +429,8 @@ impl Publication<[u8]> {
     ///
     /// # Errors
     ///
-    /// As [`send`](Publication::send); also [`ErrorKind::ResourceExhausted`](crate::ErrorKind) for more than
-    /// [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
+    /// Returns the errors of [`send`](Publication::send), and [`ErrorKind::ResourceExhausted`](crate::ErrorKind) for
+    /// more than [`Telegram::MAX`](scanhub_schema::Telegram::MAX) bytes.
     pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Error> {
         let header = self.header();
         self.send_bytes_with(&header, bytes)?;

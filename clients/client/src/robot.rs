@@ -1,4 +1,4 @@
-//! The robot's verdict: its sensors' zones combined; a sensor without recent data counts as unknown.
+//! The robot's verdict: the zones of its sensors, combined. A sensor without recent data counts as unknown.
 
 use std::time::{Duration, Instant};
 
@@ -14,8 +14,9 @@ use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 use crate::zones::{Freshness, Heard, ZonesSource};
 
-/// Follows the zones of `sensors` in the domain that SCANHUB_DOMAIN names. If empty: all sensors of the hub there; in a
-/// domain without a hub, the sensors of other machines that are published there. The hub may start later.
+/// Subscribes to the zones of `sensors` in the domain that SCANHUB_DOMAIN names. Without names, it follows all sensors
+/// of the hub. In a domain without a hub, it follows the sensors of other machines that are published there. The hub
+/// may start later.
 ///
 /// # Examples
 ///
@@ -33,12 +34,12 @@ use crate::zones::{Freshness, Heard, ZonesSource};
 ///
 /// # Errors
 ///
-/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is invalid.
 pub fn robot(sensors: &[&str]) -> Result<RobotSubscriber, Error> {
     RobotSubscriber::builder(sensors).open()
 }
 
-/// What is known of the robot's surroundings: the zones of each sensor.
+/// State of the robot's surroundings: the zones of each sensor.
 #[derive(Clone, Debug, Default)]
 pub struct Robot {
     parts: Vec<(String, Zones)>,
@@ -63,12 +64,12 @@ impl Robot {
         self.parts.iter().filter_map(|(sensor, zones)| Some((zones.nearest()?.1, sensor.as_str()))).min()
     }
 
-    /// Returns each sensor's verdict; unknown where it was not heard lately, or never.
+    /// Returns each sensor's verdict. It is unknown if the sensor has sent no recent data.
     pub fn sensors(&self) -> impl Iterator<Item = (&str, Verdict)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones.verdict()))
     }
 
-    /// Returns each sensor's zones; unknown where it was not heard lately, or never.
+    /// Returns each sensor's zones. They are unknown if the sensor has sent no recent data.
     pub fn zones(&self) -> impl Iterator<Item = (&str, &Zones)> {
         self.parts.iter().map(|(sensor, zones)| (sensor.as_str(), zones))
     }
@@ -242,7 +243,7 @@ impl RobotSource {
     ///
     /// # Errors
     ///
-    /// As [`ZonesSource::receive`].
+    /// Returns the errors of [`ZonesSource::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<RobotHeard>, Error> {
         let heard = self.hear(session)?;
         Ok(heard.map(|heard| RobotHeard { robot: self.robot.clone(), heard }))
@@ -260,7 +261,7 @@ impl RobotSource {
     ///
     /// # Errors
     ///
-    /// As [`ZonesSource::receive`].
+    /// Returns the errors of [`ZonesSource::receive`].
     pub fn drain(&mut self, session: &mut Session) -> Result<bool, Error> {
         let mut any = false;
         while self.hear(session)?.is_some() {

@@ -1,4 +1,4 @@
-//! A sample of any topic, and where such come from: for programs that follow topics of several kinds.
+//! Samples of any topic, and their sources, for programs that follow topics of several kinds.
 
 use std::time::Duration;
 
@@ -8,39 +8,30 @@ use scanhub_schema::{Header, ROBOT, Topic};
 use scanhub_shm::Payload;
 
 use crate::error::Error;
-use crate::follower::{Follower, Received};
+use crate::follower::Received;
 use crate::robot::{RobotHeard, RobotSource};
 use crate::session::Session;
 use crate::silence::Silence;
+use crate::subscribe::Subscribe;
 use crate::zones::{Heard, ZonesSource};
 
-/// Zones are followed with an eye on their age, all else as it comes.
-macro_rules! sample {
+/// Kind of the subscriber of a topic: zones expire, other samples do not.
+macro_rules! kind {
     (Zones $payload:tt) => {
         Heard
     };
     ($topic:ident $payload:tt) => {
-        Received<scanhub_schema::payload_type!($payload)>
+        scanhub_schema::payload_type!($payload)
     };
 }
 
-/// Where such a sample comes from.
-macro_rules! source {
-    (Zones $payload:tt) => {
-        ZonesSource
-    };
-    ($topic:ident $payload:tt) => {
-        Follower<scanhub_schema::payload_type!($payload)>
-    };
-}
-
-/// Declares from the table of topics what a name may stand for: the sample, and the source that it comes from.
+/// Declares the samples and sources of all topics, and of the combined verdict, from the table of topics.
 macro_rules! samples {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
-        /// A received sample of one of the topics, or of the fold over several.
+        /// Received sample of one of the topics, or of the combined verdict of a robot.
         pub enum Sample {
-            $(#[doc = $about] $topic(sample!($topic $payload)),)*
-            /// The zones of a robot's sensors, folded.
+            $(#[doc = $about] $topic(<kind!($topic $payload) as Subscribe>::Item),)*
+            /// The combined zones of a robot's sensors.
             Robot(RobotHeard),
         }
 
@@ -53,23 +44,23 @@ macro_rules! samples {
             }
         }
 
-        /// Follows what one name stands for.
+        /// Source of the samples of a topic, or of the combined verdict of a robot.
         pub enum Source {
-            $(#[doc = $about] $topic(source!($topic $payload)),)*
-            /// The zones of a robot's sensors, folded.
+            $(#[doc = $about] $topic(<kind!($topic $payload) as Subscribe>::Source),)*
+            /// The combined zones of a robot's sensors.
             Robot(RobotSource),
         }
 
         impl Source {
-            /// Makes what will follow `topic` of `sensor`. The zones of `robot` are the fold over all sensors.
+            /// Creates the source of `topic` of `sensor`. The zones of `robot` are the combined zones of all sensors.
             pub fn new(sensor: &str, topic: Topic) -> Source {
                 match topic {
                     Topic::Zones if sensor == ROBOT => Source::Robot(RobotSource::new(&[])),
-                    $(Topic::$topic => Source::$topic(<source!($topic $payload)>::new(sensor)),)*
+                    $(Topic::$topic => Source::$topic(<<kind!($topic $payload) as Subscribe>::Source>::new(sensor)),)*
                 }
             }
 
-            /// Returns whether the topic has been there at least once.
+            /// Returns whether the topic has existed at least once.
             pub fn subscribed(&self) -> bool {
                 match self {
                     $(Source::$topic(source) => source.subscribed(),)*
@@ -77,7 +68,8 @@ macro_rules! samples {
                 }
             }
 
-            /// Returns why no sample arrives, as [`Follower::why_silent`] does.
+            /// Returns why no sample arrives, as [`Follower::why_silent`](crate::streams::Follower::why_silent)
+            /// does.
             pub fn why_silent(&mut self, session: &mut Session) -> Silence {
                 match self {
                     $(Source::$topic(source) => source.why_silent(session),)*
@@ -85,11 +77,11 @@ macro_rules! samples {
                 }
             }
 
-            /// Returns the next sample that waits, or nothing.
+            /// Returns the next sample that has arrived.
             ///
             /// # Errors
             ///
-            /// As [`Follower::receive`].
+            /// Returns the errors of [`Follower::receive`](crate::streams::Follower::receive).
             pub fn receive(&mut self, session: &mut Session) -> Result<Option<Sample>, Error> {
                 Ok(match self {
                     $(Source::$topic(source) => source.receive(session)?.map(Sample::$topic),)*
@@ -112,7 +104,7 @@ impl Source {
         }
     }
 
-    /// Returns the time after which the source may report a silence. `None` if it never does.
+    /// Returns the time after which the source may report a silence. `None` if it reports no silences.
     pub fn left(&self) -> Option<Duration> {
         match self {
             Source::Zones(source) => source.left(),
@@ -148,7 +140,7 @@ impl Sample {
         self.header().is_none()
     }
 
-    /// Returns the payload as it lies in memory; of the fold that of the sensor that was heard.
+    /// Returns the payload as it is in memory. For a robot, it is that of the sensor that sent the sample.
     pub fn bytes(&self) -> &[u8] {
         self.any().bytes()
     }
@@ -168,7 +160,7 @@ impl Sample {
     }
 }
 
-/// What every sample can be asked.
+/// Properties that all samples have.
 trait AnySample {
     fn header(&self) -> Option<&Header>;
     fn missed(&self) -> u64;

@@ -274,7 +274,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// As [`wait`](Self::wait).
+    /// Returns the errors of [`wait`](Self::wait).
     pub fn wait_for(&mut self, left: Option<Duration>) -> Result<(), Error> {
         let left = left.map_or(LONGEST_WAIT, |left| left.min(LONGEST_WAIT));
         // This takes events that a program that polls has not seen, so the descriptor stays readable until it is
@@ -293,8 +293,7 @@ impl Session {
 }
 
 /// Descriptor for programs that also wait for other things: an epoll over a timer, the events of each hub, and the
-/// start and end of hubs. It is
-/// readable while there may be something to receive or to check.
+/// start and end of hubs. It is readable while there may be something to receive or to check.
 struct Readiness {
     descriptor: Arc<OwnedFd>,
     clock: OwnedFd,

@@ -104,7 +104,7 @@ pub trait ItemSource {
         self.receive(session)
     }
 
-    /// Returns the time after which there is something to receive although no sample arrives. `None` if there never is.
+    /// Returns the time after which the source has an item even if no sample arrives. `None` if only samples are items.
     fn left(&self) -> Option<Duration> {
         None
     }

@@ -18,9 +18,9 @@ pub enum Wait {
     /// several sensors at once, it uses the event.
     #[default]
     Doorbell,
-    /// Sleep on the event, which other languages use; the hub sends one message to each consumer.
+    /// Sleep on the event, which other languages use; the hub sends one message to each subscriber.
     Event,
-    /// Do not sleep: reads the words all the time, which uses a whole processor, for the shortest latency.
+    /// Do not sleep: read the words all the time. It has the shortest latency, and uses one CPU core completely.
     Spin,
 }
 

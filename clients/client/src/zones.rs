@@ -15,7 +15,7 @@ use crate::silence::Silence;
 use crate::subscribe::sealed::Sealed;
 use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 
-/// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
+/// Subscribes to the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
 /// # Examples
 ///
@@ -35,7 +35,7 @@ use crate::subscribe::{ItemSource, Subscribe, Subscriber};
 ///
 /// # Errors
 ///
-/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is not possible.
+/// [`ErrorKind::InvalidInput`](crate::ErrorKind) if a name is invalid.
 pub fn zones(sensor: &str) -> Result<ZonesSubscriber, Error> {
     ZonesSubscriber::builder(sensor).open()
 }
@@ -51,7 +51,7 @@ pub struct Heard {
     pub missed: u64,
     /// The zones are unknown because no recent data arrived, not because the hub reports it.
     pub stale: bool,
-    /// What the hub sent, however old it was on arrival: to store it, not to act on it.
+    /// The zones that the hub sent, however old they were on arrival. Store them, but do not act on them.
     pub said: Zones,
 }
 
@@ -157,7 +157,7 @@ impl ZonesSource {
     ///
     /// # Errors
     ///
-    /// As [`Follower::receive`].
+    /// Returns the errors of [`Follower::receive`].
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Error> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();

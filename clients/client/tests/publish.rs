@@ -18,7 +18,7 @@ fn marks(count: u8) -> Marks {
     Marks { count, ..Marks::default() }
 }
 
-/// What a consumer says of its next sample: missed, restarted, number, marks.
+/// Returns the properties of the next sample: missed, restarted, number, marks.
 fn next(followed: &mut Subscriber<Marks>) -> (u64, bool, u64, u8) {
     let sample = followed.next().unwrap().expect("a sample in time");
     (sample.missed, sample.restarted, sample.header().topic_seq, sample.count)
@@ -59,7 +59,7 @@ fn it_is_followed_without_a_hub_and_what_is_skipped_is_missed() {
     assert_eq!(publisher(place.domain.root()), Ok(None), "the domain is held by nobody");
 }
 
-/// As a hub that sends nothing wakes nobody: a consumer sleeps until it is woken, once for several samples.
+/// `send_with` wakes no program. A subscriber sleeps until `wake`, which the program calls once for several samples.
 #[test]
 fn samples_that_are_sent_together_wake_once() {
     let place = Place::new();
@@ -73,7 +73,7 @@ fn samples_that_are_sent_together_wake_once() {
     assert_eq!(zones.send_with(&header, |sample| *sample = Zones::unknown()).unwrap(), 0);
     sensor.wake(Wake::Telegram).unwrap();
     assert_eq!(next(&mut followed), (0, false, 0, 1));
-    // Who comes later gets what the topic keeps.
+    // A late joiner gets the samples that the topic stores.
     let mut late = Subscriber::<Zones>::builder("tracker.near").in_domain(&place.domain).open().unwrap();
     until("the last zones", || {
         zones.connect();
@@ -99,7 +99,7 @@ fn another_life_begins_again() {
     assert_eq!(next(&mut followed), (0, false, 0, 1));
     drop(near);
     let mut near = open();
-    // Its consumer has to find it first.
+    // Its subscriber has to find it first.
     until("the consumer", || {
         let _ = followed.try_next().unwrap();
         near.subscribers() == 1
@@ -208,7 +208,7 @@ fn programs_with_names_of_their_own_publish_at_once_with_a_hub_and_without() {
         got[2] |= scans.try_next().unwrap().is_some();
         got == [true; 3]
     });
-    // A name is free as soon as nobody publishes under it any more.
+    // A name is free as soon as no process publishes under it.
     drop((tracks, house));
     beside("house").unwrap();
 }

@@ -73,7 +73,7 @@ impl<P: Payload + ?Sized> Port<P> {
         until("subscribers", || self.subscribers() == count);
     }
 
-    /// Returns the number of subscribers that the next sample reaches. The service's own number is no proof: it
+    /// Returns the number of subscribers that the next sample reaches. The service's own number does not count: it
     /// includes a subscriber that is about to enter the list, which a publisher does not see yet.
     pub(crate) fn subscribers(&self) -> usize {
         let mut count = 0;
@@ -96,12 +96,12 @@ pub(crate) struct FakeSensor {
     pub(crate) status: Port<Status>,
     pub(crate) waker: Waker,
     pub(crate) boot: u64,
-    /// Of the headers.
+    /// Flags of the headers.
     pub(crate) flags: u8,
     pub(crate) seq: u64,
-    /// CLOCK_MONOTONIC at its first telegram, in ns; without a word long before any consumer.
+    /// CLOCK_MONOTONIC at its first telegram, in ns. By default long before any subscriber.
     pub(crate) begun_ns: u64,
-    /// Of the scans, in us.
+    /// Period of the scans in us.
     pub(crate) period_us: u32,
 }
 
@@ -121,7 +121,7 @@ impl FakeSensor {
         }
     }
 
-    /// Publishes a scan of these ranges and wakes the consumers.
+    /// Publishes a scan of these ranges and wakes the subscribers.
     pub(crate) fn scan(&mut self, ranges: &[u16]) {
         let header = self.header(self.scan.topic_seq);
         let head = ScanHead::lms(ranges.len(), -90_000, 500, 10, 13);
@@ -159,14 +159,14 @@ impl FakeSensor {
         self.waker.wake(Wake::Telegram).unwrap();
     }
 
-    /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the consumers.
+    /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the subscribers.
     pub(crate) fn zones(&mut self, verdict: Verdict, nearest_mm: u32) {
         let now = clock_gettime(ClockId::Monotonic);
         let now_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
         self.zones_of(verdict, nearest_mm, now_ns);
     }
 
-    /// As [`zones`](Self::zones), measured at `stamp_ns`.
+    /// Publishes zones as [`zones`](Self::zones) does, measured at `stamp_ns`.
     pub(crate) fn zones_of(&mut self, verdict: Verdict, nearest_mm: u32, stamp_ns: u64) {
         let header = self.header(self.zones.topic_seq);
         let mut sample = self.zones.publisher.loan().unwrap();
@@ -179,7 +179,7 @@ impl FakeSensor {
         self.waker.wake(Wake::Telegram).unwrap();
     }
 
-    /// Publishes a telegram and wakes the consumers.
+    /// Publishes a telegram and wakes the subscribers.
     pub(crate) fn telegram(&mut self, bytes: &[u8]) {
         let header = self.header(self.telegram.topic_seq);
         let mut sample = self.telegram.publisher.loan_slice_uninit(bytes.len()).unwrap();
@@ -190,7 +190,7 @@ impl FakeSensor {
         self.waker.wake(Wake::Telegram).unwrap();
     }
 
-    /// Publishes a status and wakes the consumers.
+    /// Publishes a status and wakes the subscribers.
     pub(crate) fn status(&mut self, change: impl FnOnce(&mut Status)) {
         let header = self.header(self.status.topic_seq);
         let mut sample = self.status.publisher.loan().unwrap();
