@@ -245,9 +245,7 @@ impl Topics {
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
             }
-            let Change { gone, back } = self.session.look()?;
-            self.notices.extend(gone.map(|_| "hub_gone"));
-            self.notices.extend(back.map(|_| "hub_back"));
+            self.look()?;
             if self.session.domain().is_none() {
                 let error = self.session.no_hub_here();
                 if error.kind() == ErrorKind::OtherUser {
@@ -264,6 +262,14 @@ impl Topics {
                 return Ok(None);
             }
         }
+    }
+
+    /// Looks for the hub, and notes its changes.
+    fn look(&mut self) -> Result<(), Error> {
+        let Change { gone, back } = self.session.look()?;
+        self.notices.extend(gone.map(|_| "hub_gone"));
+        self.notices.extend(back.map(|_| "hub_back"));
+        Ok(())
     }
 
     fn receive(&mut self, only_subscribed: bool) -> Result<Option<(usize, AnySample)>, Error> {
@@ -385,6 +391,8 @@ impl Follow for Topics {
 
     fn why_silent(&mut self) -> Vec<Silence> {
         let mut reasons = Vec::new();
+        // The sources look for the hub, too, and would not note its changes. They return the same errors.
+        let _ = self.look();
         for Followed { source, .. } in &mut self.sources {
             match source.why_silent(&mut self.session) {
                 Silence::Waiting => {}
