@@ -100,7 +100,7 @@ pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outc
 }
 
 /// Returns the options of a subscriber of a topic of the hub of this domain.
-pub(crate) fn builder<P: Payload + ?Sized>(domain: &str, sensor: &str) -> SubscriberBuilder<Subscriber<P>> {
+pub(crate) fn builder<P: Payload + ?Sized>(domain: &str, sensor: &str) -> SubscriberBuilder<P> {
     Subscriber::builder(sensor).domain(domain)
 }
 
