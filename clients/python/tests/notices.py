@@ -22,7 +22,7 @@ while not select.select([sys.stdin], [], [], 0.05)[0]:
 sys.stdin.readline()
 print('{"class": "waits"}', flush=True)
 sys.stdin.readline()
-# Now the subscription asks whether its hub runs.
+# After this time, the subscription checks again whether its hub runs.
 time.sleep(1.2)
 try:
     next(statuses)

@@ -610,9 +610,9 @@ int scanhub_open(struct scanhub_attachment **handle, const char *domain, const c
 /*
  * Starts to follow the verdict over the zones of `sensors`: names with blanks between them, "front rear". NULL means all
  * sensors of the hub. In a domain without a hub, it means the sensors of other machines that are published there.
- * scanhub_take then lends a struct scanhub_robot (a copy without header): once every sensor has a verdict, whenever one gets
- * a new verdict, and when one is silent for too long, whose verdict then becomes unknown by itself. Everything else is as
- * with scanhub_open.
+ * scanhub_take then lends a struct scanhub_robot, a copy without header. The first one is lent when every sensor has a
+ * verdict. Another one is lent when a sensor has a new verdict, or is silent for too long: its verdict then becomes unknown by
+ * itself. Everything else is as with scanhub_open.
  */
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
