@@ -43,7 +43,10 @@ impl Recording {
             return Err(Error::new("NoTopic", what, "name topics, as in topics=[\"scan\"]").into());
         }
         let family = family.map(|name| {
-            let unknown = || Error::new("Impossible", format!("no family {name:?}"), "lms, ld or rplidar");
+            let unknown = || {
+                let names = Family::ALL.map(Family::name).join(", ");
+                Error::new("Impossible", format!("no family {name:?}"), format!("the families are {names}"))
+            };
             Family::parse(&name).ok_or_else(unknown)
         });
         let family = family.transpose()?;
@@ -158,7 +161,7 @@ impl Recording {
 
 fn parse(name: &str) -> Result<Topic, Error> {
     let unknown = || {
-        let names = RecordingReader::TOPICS.map(Topic::name);
+        let names: Vec<_> = RecordingReader::topics().map(Topic::name).collect();
         Error::new("NoTopic", format!("no topic {name:?}"), format!("the topics are {}", names.join(", ")))
     };
     Topic::parse(name).ok_or_else(unknown)

@@ -99,7 +99,7 @@ def what_cannot_be_read() -> None:
     refusal(scanhub.NoTopic, '"left"', "front, rear", file=two, sensor="left")
     refusal(scanhub.Impossible, "several sensors: front, rear", 'sensor="front"', file=two)
     refusal(scanhub.Impossible, "without its scans", file=log, topics="zones")
-    refusal(scanhub.Impossible, '"lsm"', "lms, ld or rplidar", file=log, family="lsm")
+    refusal(scanhub.Impossible, '"lsm"', "families are lms", file=log, family="lsm")
     refusal(scanhub.Failure, "no.toml", "No such file", file=log, config=os.path.join(place, "no.toml"))
     wrong = write("wrong.toml", b"zones.radius = [1]\n")
     refusal(scanhub.Impossible, wrong, "`radius`", "radii", file=log, config=wrong)

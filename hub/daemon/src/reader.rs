@@ -87,18 +87,10 @@ struct Parts {
 type Links<'a> = Vec<ReadLink<'a>>;
 
 impl RecordingReader {
-    /// Topics that a link publishes from telegrams. Early warnings need parts of telegrams.
-    pub const TOPICS: [Topic; 9] = [
-        Topic::Telegram,
-        Topic::Scan,
-        Topic::Marks,
-        Topic::Zones,
-        Topic::Foreground,
-        Topic::Background,
-        Topic::Status,
-        Topic::Lines,
-        Topic::Motion,
-    ];
+    /// Returns the topics that a link publishes from whole telegrams. Early warnings need parts of telegrams.
+    pub fn topics() -> impl Iterator<Item = Topic> {
+        Topic::OF_LINKS.into_iter().filter(|topic| *topic != Topic::Early)
+    }
 
     /// Opens a recording. This reads the file to its end once.
     ///
@@ -179,10 +171,10 @@ impl Iterator for RecordingReader {
 
 /// Checks that a replay publishes `topic`.
 fn check(topic: Topic) -> Result<(), Failure> {
-    if RecordingReader::TOPICS.contains(&topic) {
+    if RecordingReader::topics().any(|known| known == topic) {
         return Ok(());
     }
-    let names: Vec<_> = RecordingReader::TOPICS.iter().map(|topic| topic.name()).collect();
+    let names: Vec<_> = RecordingReader::topics().map(Topic::name).collect();
     let message = format!("{} is not computed from a recording", topic.name());
     Err(Failure::new(Kind::NoTopic, message, format!("the topics are {}", names.join(", "))))
 }

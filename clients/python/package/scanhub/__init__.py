@@ -320,7 +320,7 @@ def read(
     those of `scanhub replay --rate max`, with the settings in the file `config`.
 
     Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a recording
-    without names. `family` is that of a stream, `lms`, `ld` or `rplidar` (None: recognized by the bytes). Warns with
+    without names. `family` is the family of the scanner that sent a stream (None: recognized by the bytes). Warns with
     RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a wrong configuration.
     """
     names = (topics,) if isinstance(topics, str) else tuple(topics)
