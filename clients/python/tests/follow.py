@@ -4,6 +4,7 @@ Ends by Ctrl-C, and says so."""
 import json
 import math
 import os
+import signal
 import sys
 
 import scanhub
@@ -172,9 +173,11 @@ def status(sample: scanhub.Status) -> dict:
 
 
 def say(line: dict) -> None:
-    """With one system call, so that Ctrl-C leaves no half of it."""
+    """With one system call that Ctrl-C does not interrupt, so that a full pipe gets no half of it."""
     written = (json.dumps(line) + "\n").encode()
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     assert os.write(sys.stdout.fileno(), written) == len(written)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def notice(kind: str) -> None:
