@@ -1,6 +1,6 @@
 //! Reads a recording without a hub: the code of a replay computes the samples, and this process has them in its memory.
 //!
-//! A link plays each sensor, as in [`replay`](crate::replay) at maximum rate, so that payloads are equal bit for bit.
+//! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for bit.
 //! Nothing waits, and there is no thread. [`RecordingReader::step`] plays the next telegram of the sensor that has the
 //! earliest one, and publishes its samples into a queue. Memory is for these samples, not for the file.
 
