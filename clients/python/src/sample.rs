@@ -264,7 +264,7 @@ pub(crate) fn array<T: Element>(py: Python<'_>, elements: Vec<T>) -> PyResult<Bo
     shaped(py, elements, shape)
 }
 
-/// Returns a numpy array of `shape` with these elements, the last dimension first.
+/// Returns a numpy array of `shape` with these elements, row by row.
 pub(crate) fn shaped<T: Element>(
     py: Python<'_>,
     elements: Vec<T>,
