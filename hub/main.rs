@@ -133,14 +133,19 @@ fn print_own(text: &str) -> Result<(), Failure> {
 
 /// Writes one line to stdout. Ignores errors, as of a reader that has closed it.
 fn say(line: &str) {
-    let _ = io::stdout().lock().write_all(format!("{}\n", Printable(line)).as_bytes());
+    let _ = print(line);
 }
 
+/// Prints the error of a verb: with `json` as a JSON line on stdout, which goes to stderr if `quiet`, otherwise as text on
+/// stderr.
 fn report(failure: &Failure, json: bool, quiet: bool) {
-    match (json, quiet) {
-        (true, false) => say(&scanhub_verbs::error_line(failure)),
-        (true, true) => complain(&scanhub_verbs::error_line(failure)),
-        (false, _) => complain(&format!("scanhub: {failure}")),
+    if !json {
+        return complain(&format!("scanhub: {failure}"));
+    }
+    let line = scanhub_verbs::error_line(failure);
+    // A full disk takes no error either.
+    if quiet || print(&line).is_err() {
+        complain(&line);
     }
 }
 

@@ -241,7 +241,7 @@ fn a_program_in_c_learns_why_no_sample_arrives() {
     let is_streaming = |line: &Value| has(waiting, "")(line) && number(line, "silent_ns") < 100_000_000;
     scans.await_line("scans", is_streaming);
     assert_eq!(env.run(&["control", "front", "pause"]).code, Some(0));
-    let line = scans.await_line("the pause", has(paused, "front is paused\n  scanhub resume front"));
+    let line = scans.await_line("the pause", has(paused, "front is paused\n  scanhub control front resume"));
     assert!(number(&line, "silent_ns") > 0, "{line}");
     assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
     scans.await_line("scans again", is_streaming);

@@ -23,7 +23,7 @@ fn a_telegram_costs_no_more_than_before() {
     const MOST_SYSTEM_CALLS: u64 = 9;
 
     /// Telegrams that are stepped through. Each takes some seconds.
-    const STEPPED: usize = 5;
+    const STEPPED: usize = 10;
     /// Telegrams whose system calls are counted, and telegrams before them. By then, the hub has learned how long before
     /// the end of a telegram it has to wake up.
     const COUNTED: usize = 40;

@@ -288,6 +288,7 @@ fn a_disk_that_is_full_is_told() {
         &["completions", "bash"],
         &["man"],
         &["doctor", "--no-system-config", "/dev/null"],
+        &["doctor", "--json", "--no-system-config", "/dev/null"],
         &["replay", "--no-system-config", "--rate", "max", &log],
     ] {
         let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");

@@ -134,7 +134,7 @@ impl Silence {
             Silence::Absent { sensor, .. } => {
                 format!("`scanhub info {sensor}` shows the link; check cable, port and power of the scanner")
             }
-            Silence::Paused { sensor } => format!("scanhub resume {sensor}"),
+            Silence::Paused { sensor } => format!("scanhub control {sensor} resume"),
             Silence::Waiting => String::new(),
         }
     }

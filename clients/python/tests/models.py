@@ -51,8 +51,8 @@ def the_flow_is_ordered() -> None:
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        until(lambda: reason() == ("nothing of front/scan in 0.5 s: front is paused", "scanhub resume front") and caught)
-    assert str(caught[0].message) == "nothing yet: front is paused\n  scanhub resume front", caught[0]
+        until(lambda: reason() == ("nothing of front/scan in 0.5 s: front is paused", "scanhub control front resume") and caught)
+    assert str(caught[0].message) == "nothing yet: front is paused\n  scanhub control front resume", caught[0]
     assert len(caught) == 1 and paused.silent_for() >= 2
     scanhub.control("front", "resume", domain=domain, root=root)
     until(lambda: state() == "streaming")
