@@ -163,7 +163,7 @@ const FIELDS = [
   ["damaged on the line", "loss", ({ loss }) => percent(loss)],
   ["lost on the line; missed by this program", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
 ];
-// Without a decimal where it would not fit beside another one.
+// Long values have no decimals, so that two fit in a line.
 const millis = (ms) => ms.toFixed(ms < 100 ? 1 : 0);
 const percent = (share) => `${(100 * share).toFixed(!share ? 0 : share < 0.1 ? 2 : 1)} %`;
 const WELL = 0.001;
