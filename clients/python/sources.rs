@@ -8,9 +8,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// Directories below a package that do not change the module.
-const LEFT_OUT: [&str; 5] = ["tests", "benches", "examples", "target", "__pycache__"];
+const LEFT_OUT: [&str; 4] = ["tests", "benches", "examples", "target"];
 
-/// Returns the hash of all files in `packages`, relative to the directory `root` of the workspace.
+/// Extensions of the files that change the module. Other files are documents, or products of Python, maturin or an editor.
+const EXTENSIONS: [&str; 7] = ["rs", "toml", "txt", "py", "pyi", "typed", "lock"];
+
+/// Returns the hash of the sources in `packages`, relative to the directory `root` of the workspace.
 pub(crate) fn hash(root: &Path, packages: &BTreeSet<String>) -> io::Result<String> {
     let mut hasher = DefaultHasher::new();
     for package in packages {
@@ -48,12 +51,13 @@ fn add(root: &Path, path: &Path, hasher: &mut DefaultHasher) -> io::Result<()> {
         .collect::<io::Result<_>>()?;
     names.sort();
     for name in names {
-        if name.file_name().is_some_and(|file| LEFT_OUT.iter().any(|left_out| file == *left_out)) {
+        let file = name.file_name().unwrap_or_default().to_string_lossy();
+        if file.starts_with('.') || LEFT_OUT.contains(&&*file) {
             continue;
         }
         if root.join(&name).is_dir() {
             add(root, &name, hasher)?;
-        } else {
+        } else if name.extension().is_some_and(|it| EXTENSIONS.iter().any(|extension| it == *extension)) {
             (&name, fs::read(root.join(&name))?).hash(hasher);
         }
     }

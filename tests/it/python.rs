@@ -10,7 +10,7 @@ use std::process::Command;
 
 use crate::testkit::{
     INT, KILL, Outcome, Program, Sender, TERM, TestEnv, client_python, in_a_network, is_class, number,
-    output, python, skip, until,
+    output, python, python_for, skip, until,
 };
 use scanhub_schema::limits::TopicLimits;
 use scanhub_schema::{Header, Status, Topic, Verdict, Zones};
@@ -58,6 +58,18 @@ fn arrays_are_views_of_shared_memory() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "views") else { return };
     let _running = streaming(&env);
+    passed(command);
+}
+
+#[test]
+fn tasks_wait_in_a_loop_of_uvloop() {
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "views") else { return };
+    if python_for("uvloop", "uvloop").is_none() {
+        return;
+    }
+    let _running = streaming(&env);
+    command.arg("uvloop");
     passed(command);
 }
 

@@ -6,7 +6,7 @@ use std::fmt::Display;
 use std::io::Write;
 
 /// What tests can do without, by its name in `SCANHUB_REQUIRE`.
-const NEEDS: [&str; 26] = [
+const NEEDS: [&str; 27] = [
     "bash",
     "cc",
     "c++",
@@ -19,6 +19,8 @@ const NEEDS: [&str; 26] = [
     "python-packages",
     // Draws the picture of an example.
     "matplotlib",
+    // An event loop in place of that of asyncio.
+    "uvloop",
     // The vendor's driver of the RPLIDARs, of which there is no build for every Python.
     "rplidar-driver",
     "setsid",

@@ -106,7 +106,7 @@ impl Subscriber<Robot> {
         self.wait_for_next()
     }
 
-    /// Returns what is known now, whether or not it is news. It never waits.
+    /// Returns what is known now, even if it has not changed. It never waits.
     ///
     /// # Errors
     ///
@@ -167,7 +167,7 @@ pub struct RobotSource {
     nobody: Freshness,
     /// Origin of the sensors.
     whose: Whose,
-    /// Time of the next look for new sensors, while a hub or a listener publishes.
+    /// Time of the next search for new sensors, while a hub or a listener publishes.
     call_at: Option<Instant>,
     /// Whether early warnings count too.
     early: bool,
@@ -200,7 +200,7 @@ const MOST_REMOTE: usize = 16;
 /// this name.
 const OTHERS: &str = "others...";
 
-/// Interval at which the source looks for new sensors. A hub that is starting creates its topics one after the other.
+/// Interval at which the source searches for new sensors. A hub that is starting creates its topics one after the other.
 const CALL_EVERY: Duration = Duration::from_secs(1);
 
 impl RobotSource {
@@ -270,7 +270,7 @@ impl RobotSource {
         Ok(any)
     }
 
-    /// Takes all samples and silences, and looks for the hub. Returns whether there were any.
+    /// Takes all samples and silences, and checks for the hub. Returns whether there were any.
     fn hear_all(&mut self, session: &mut Session) -> Result<bool, Error> {
         // Samples that have arrived come first, as with one sensor. But a program that always finds some must also
         // notice a new hub.
@@ -280,10 +280,13 @@ impl RobotSource {
     }
 
     /// Returns the reason of the first sensor whose verdict is unknown and that has a reason. Without sensors, it is
-    /// the reason why no hub runs.
+    /// the reason why no hub runs, or that the hub has none with zones.
     pub fn why_silent(&mut self, session: &mut Session) -> Silence {
         if let Some(reason) = Silence::of_hub(session) {
             return reason;
+        }
+        if self.parts.is_empty() {
+            return Silence::of_all_sensors(session);
         }
         let verdicts = self.robot.sensors().map(|(_, verdict)| verdict);
         let unknown = self.parts.iter_mut().zip(verdicts).filter(|(_, verdict)| *verdict == Verdict::Unknown);

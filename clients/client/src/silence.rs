@@ -7,6 +7,7 @@ use scanhub_shm::{Domain, Node, Payload, PortFactory, ThreadSafeService};
 
 use crate::error::Error;
 use crate::follower::Follower;
+use crate::presence::Who;
 use crate::session::Session;
 
 /// Reason why a subscriber receives no samples. `Display` writes one line; [`Silence::remedy`] returns what the user
@@ -33,7 +34,8 @@ pub enum Silence {
     /// The hub has no such sensor.
     #[non_exhaustive]
     UnknownSensor {
-        /// Name of the sensor to which the program has subscribed.
+        /// Name of the sensor to which the program has subscribed. Empty if it follows all sensors with zones, and the hub
+        /// has none.
         sensor: String,
         /// Names of the sensors that exist.
         sensors: Vec<String>,
@@ -104,9 +106,7 @@ impl Silence {
     /// Returns the reason for a topic that does not exist, if `published` is everything that the hub publishes. `None`
     /// if the topic exists.
     pub(crate) fn of_topics(sensor: &str, topic: Topic, published: &[(String, Topic)]) -> Option<Silence> {
-        let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
-        sensors.sort();
-        sensors.dedup();
+        let sensors = names(published);
         if !sensors.iter().any(|known| known == sensor) {
             return Some(Silence::UnknownSensor { sensor: sensor.to_owned(), sensors });
         }
@@ -116,6 +116,18 @@ impl Silence {
             topic: format!("{sensor}/{}", topic.name()),
             topics: topics.iter().map(|topic| topic.name().to_owned()).collect(),
         })
+    }
+
+    /// Returns the reason for a robot that follows all sensors and has found none.
+    pub(crate) fn of_all_sensors(session: &Session) -> Silence {
+        // A listener publishes a sensor as soon as another machine sends it.
+        let is_complete = session.publishes() == Some(Who::Hub) && !session.hub_is_starting();
+        let Some(domain) = session.domain().filter(|_| is_complete) else { return Silence::Waiting };
+        match scanhub_shm::published(domain) {
+            Ok(published) if published.iter().any(|(_, topic)| *topic == Topic::Zones) => Silence::Waiting,
+            Ok(published) => Silence::UnknownSensor { sensor: String::new(), sensors: names(&published) },
+            Err(failure) => Silence::of_shortage(&failure.into()),
+        }
     }
 
     /// Returns what the user can do about it. Empty for [`Silence::Waiting`].
@@ -147,6 +159,9 @@ impl fmt::Display for Silence {
             | Silence::OtherUser { message, .. }
             | Silence::Full { message, .. } => {
                 write!(f, "{}", Printable(message))
+            }
+            Silence::UnknownSensor { sensor, .. } if sensor.is_empty() => {
+                write!(f, "the hub has no sensor with zones")
             }
             Silence::UnknownSensor { sensor, .. } => write!(f, "the hub has no sensor {sensor}"),
             Silence::UnknownTopic { topic, .. } => write!(f, "the hub does not publish {topic}"),
@@ -237,6 +252,14 @@ fn published(session: &Session, domain: &Domain, sensor: &str) -> Result<Vec<(St
         published.extend(is_served.then_some((name, topic)));
     }
     Ok(published)
+}
+
+/// Returns the names of the sensors, sorted.
+fn names(published: &[(String, Topic)]) -> Vec<String> {
+    let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
+    sensors.sort();
+    sensors.dedup();
+    sensors
 }
 
 macro_rules! has_publisher {

@@ -86,15 +86,15 @@ pub trait ItemSource {
     /// Received item.
     type Item;
 
-    /// Returns whether an item can arrive without a look for the hub.
+    /// Returns whether an item can arrive without a check for the hub.
     fn subscribed(&self) -> bool;
 
     /// Returns the next item that has arrived.
     fn receive(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error>;
 
-    /// Looks for the hub if necessary, and returns the next item that has arrived.
+    /// Checks for the hub if necessary, and returns the next item that has arrived.
     fn look(&mut self, session: &mut Session) -> Result<Option<Self::Item>, Error> {
-        // Samples that have arrived come first, because the look for the hub takes longer than receiving.
+        // Samples that have arrived come first, because the check for the hub takes longer than receiving.
         if self.subscribed()
             && let Some(item) = self.receive(session)?
         {

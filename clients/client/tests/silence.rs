@@ -10,7 +10,7 @@ use scanhub_client::{
     ErrorKind, Marks, Publication, RobotSubscriber, Scan, Silence, Subscriber, Tilt, Verdict, ZonesSubscriber,
 };
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{Failure, Kind, State, Topic};
+use scanhub_schema::{Failure, Kind, State, Topic, Zones};
 use scanhub_shm::{Payload, PortFactory};
 
 fn scans(place: &Place, sensor: &str) -> Subscriber<Scan> {
@@ -114,6 +114,26 @@ fn a_robot_has_the_reason_of_its_first_unknown_sensor() {
         all.now().unwrap().verdict() == Verdict::Clear
     });
     assert_eq!(all.why_silent(), Silence::Waiting);
+}
+
+#[test]
+fn a_robot_of_a_hub_without_zones_says_so() {
+    let place = Place::new();
+    let mut robot = RobotSubscriber::builder(&[]).in_domain(&place.domain).open().unwrap();
+    let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
+    let node = scanhub_shm::hub_node(&place.domain).unwrap();
+    until("the hub", || robot.why_silent() == Silence::Waiting);
+    lock.report_ready().unwrap();
+    let silence = robot.why_silent();
+    assert_eq!(silence.to_string(), "the hub has no sensor with zones");
+    assert!(silence.remedy().contains("scanhub run --link"), "{}", silence.remedy());
+    let limits = TopicLimits::default();
+    let scan = Scan::create(&node, "front", &limits).unwrap();
+    let _scans = Scan::publisher(&scan, &limits).unwrap();
+    assert_eq!(robot.why_silent().remedy(), "the sensors are front");
+    let zones = Zones::create(&node, "front", &limits).unwrap();
+    let _zones = Zones::publisher(&zones, &limits).unwrap();
+    assert_eq!(robot.why_silent(), Silence::Waiting);
 }
 
 #[test]

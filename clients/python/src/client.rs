@@ -30,7 +30,7 @@ type ClientError = scanhub_client::Error;
 /// Maximum time of one wait. After it, the caller handles signals.
 const LONGEST_WAIT: Duration = Duration::from_millis(100);
 
-/// Time without a first sample after which the program gets a warning, if there is a reason for the silence.
+/// Time after which the program gets a warning of topics without a first sample, if there is a reason for the silence.
 const WARN_AFTER: Duration = Duration::from_secs(2);
 
 /// Interval of the checks for the reason, after the first one has found none.
@@ -170,7 +170,8 @@ pub(crate) trait Follow: Sized + Send {
     /// Returns the time of the next check for a warning. `None` after the warning, and if there is nothing to warn of.
     fn warn_at(&mut self) -> &mut Option<Instant>;
 
-    /// Returns the reasons for the silence, each once. Empty if nothing is wrong.
+    /// Returns the reasons why nothing was received since the start, each once. Empty if nothing is wrong. A subscription to
+    /// several topics checks those without a first sample.
     fn why_silent(&mut self) -> Vec<Silence>;
 
     /// Returns the time until [`warning`](Self::warning) must be called, if it may return something.
@@ -180,11 +181,10 @@ pub(crate) trait Follow: Sized + Send {
 
     /// Returns the reason why nothing was received, once and after [`WARN_AFTER`].
     fn warning(&mut self) -> Option<Error> {
-        let now = Instant::now();
-        self.warn_at().take_if(|at| *at <= now)?;
+        self.warn_at().take_if(|at| *at <= Instant::now())?;
         let reason = Error::of_silence(&self.why_silent());
         if reason.is_none() {
-            *self.warn_at() = Some(now + CHECK_INTERVAL);
+            *self.warn_at() = Some(Instant::now() + CHECK_INTERVAL);
         }
         reason
     }
@@ -205,7 +205,8 @@ pub(crate) struct Topics {
     /// Descriptor to poll, if the subscription waits by event.
     descriptor: Option<Arc<OwnedFd>>,
     notices: VecDeque<&'static str>,
-    /// Time of the next check for a warning; `None` before the first look, and after the first sample or the warning.
+    /// Time of the next check for a warning; `None` before the first look, after the warning, and when all topics have had a
+    /// sample.
     warn_at: Option<Instant>,
     has_left: bool,
 }
@@ -214,6 +215,7 @@ struct Followed {
     name: Name,
     source: Source,
     last: Header,
+    /// Whether it has had no sample yet.
     is_first: bool,
 }
 
@@ -241,7 +243,7 @@ impl Topics {
             if !self.notices.is_empty() {
                 return Ok(None);
             }
-            // Samples that have arrived come first, because a look for the hub takes longer than receiving.
+            // Samples that have arrived come first, because a check for the hub takes longer than receiving.
             if let Some(received) = self.receive(true)? {
                 return Ok(Some(received));
             }
@@ -264,7 +266,7 @@ impl Topics {
         }
     }
 
-    /// Looks for the hub, and notes its changes.
+    /// Checks for the hub, and notes its changes.
     fn look(&mut self) -> Result<(), Error> {
         let Change { gone, back } = self.session.look()?;
         self.notices.extend(gone.map(|_| "hub_gone"));
@@ -309,13 +311,31 @@ impl Topics {
     fn left(&self) -> Option<Duration> {
         self.sources.iter().filter_map(|followed| followed.source.left()).min()
     }
+
+    /// Returns the reasons for the silence of the sources for which `is_checked`, each once.
+    fn reasons(&mut self, is_checked: impl Fn(&Followed) -> bool) -> Vec<Silence> {
+        let mut reasons = Vec::new();
+        // The sources check for the hub, too, and would not note its changes. They return the same errors.
+        let _ = self.look();
+        for followed in self.sources.iter_mut().filter(|followed| is_checked(followed)) {
+            match followed.source.why_silent(&mut self.session) {
+                Silence::Waiting => {}
+                // It is the reason for all of them.
+                reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
+                reason if reasons.contains(&reason) => {}
+                reason => reasons.push(reason),
+            }
+        }
+        reasons
+    }
 }
 
 impl Follow for Topics {
     type Item = Sample;
 
     fn leave(&mut self) {
-        self.has_left = true;
+        (self.has_left, self.warn_at) = (true, None);
+        self.notices.clear();
         // Samples that the program keeps stay.
         self.sources.clear();
         self.session = Session::new(Vec::new());
@@ -330,9 +350,6 @@ impl Follow for Topics {
             self.begin(Wait::Doorbell);
         }
         let Some((index, sample)) = self.look_and_receive()? else { return Ok(None) };
-        if !sample.is_silence() {
-            self.warn_at = None;
-        }
         let followed = &mut self.sources[index];
         let header = sample.header().copied();
         let restarted = header.is_some_and(|header| !followed.is_first && header.boot != followed.last.boot);
@@ -340,6 +357,7 @@ impl Follow for Topics {
             (followed.last, followed.is_first) = (header, false);
         }
         let (name, header) = (followed.name.clone(), followed.last);
+        self.warn_at.take_if(|_| self.sources.iter().all(|followed| !followed.is_first));
         let (missed, stale) = (sample.missed(), matches!(&sample, AnySample::Zones(heard) if heard.stale));
         let memory = match &sample {
             // The client library has a copy already.
@@ -390,23 +408,16 @@ impl Follow for Topics {
     }
 
     fn why_silent(&mut self) -> Vec<Silence> {
-        let mut reasons = Vec::new();
-        // The sources look for the hub, too, and would not note its changes. They return the same errors.
-        let _ = self.look();
-        for Followed { source, .. } in &mut self.sources {
-            match source.why_silent(&mut self.session) {
-                Silence::Waiting => {}
-                // It is the reason for all of them.
-                reason @ (Silence::NoHub { .. } | Silence::OtherUser { .. }) => return vec![reason],
-                reason if reasons.contains(&reason) => {}
-                reason => reasons.push(reason),
-            }
+        let mut reasons = self.reasons(|followed| followed.is_first);
+        if self.sources.iter().any(|followed| !followed.is_first) {
+            // The hub has run, and `on_notice` reports its end.
+            reasons.retain(|reason| !matches!(reason, Silence::NoHub { .. } | Silence::OtherUser { .. }));
         }
         reasons
     }
 
     fn silence(&mut self, timeout: f64) -> Error {
-        let reason = Error::of_silence(&self.why_silent());
+        let reason = Error::of_silence(&self.reasons(|_| true));
         let names = self
             .sources
             .iter()

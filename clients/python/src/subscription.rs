@@ -43,19 +43,16 @@ fn poll<F: Follow>(
     this: &Arc<Confined<F>>,
     notice: Option<&Py<PyAny>>,
 ) -> PyResult<Option<F::Item>> {
-    if !is_open(this) {
-        return Ok(None);
-    }
-    loop {
+    // The callback may close the subscription.
+    while is_open(this) {
+        // First, because a topic without samples may be silent beside one that always has some.
+        warn(py, this)?;
         let item = this.with(F::try_next).transpose()?.flatten();
-        if item.is_some() {
+        if item.is_some() || !notify(py, this, notice)? {
             return Ok(item);
         }
-        if !notify(py, this, notice)? {
-            warn(py, this)?;
-            return Ok(None);
-        }
     }
+    Ok(None)
 }
 
 /// Calls the program with each notice. Returns whether there was one. If the call fails, the others stay.

@@ -64,12 +64,12 @@ def somebody_elses_domain() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def hub_without_topics() -> int:
-    """Holds the lock of a hub that has created all of its topics."""
+def hub_without_topics(pid: "int | None" = None) -> int:
+    """Holds the lock of a hub that has created all of its topics, by default of this process."""
     os.makedirs(place, mode=0o700, exist_ok=True)
-    lock = os.open(f"{place}/hub.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    lock = os.open(f"{place}/hub.lock", os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
     fcntl.fcntl(lock, fcntl.F_OFD_SETLK, struct.pack("hhqqi0q", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
-    os.write(lock, b"%d\nready\n" % os.getpid())
+    os.write(lock, b"%d\nready\n" % (pid or os.getpid()))
     return lock
 
 
@@ -103,6 +103,62 @@ def reasons_of_a_silence() -> None:
         said = str(warning.message)
         words = ("no sensor othr", "the sensors are other") if other_domain == domain else ("nothing yet: no hub", "scanhub run")
         assert all(word in said for word in words), said
+    os.close(lock)
+
+
+def a_silent_topic_beside_others() -> None:
+    lock = hub_without_topics()
+    topics = ("othr/tilt", "other/tilt", "third/tilt")
+    with publish("other") as mount, publish("third"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tilts = scanhub.subscribe(*topics, domain=domain, root=root, timeout=20)
+        assert tilts._poll() is None
+        begin = time.monotonic()
+        # A sample has always arrived before the next call.
+        while time.monotonic() - begin < 4:
+            while not mount.subscribers:
+                assert tilts._poll() is None
+            mount.send(angle_rad=0.25)
+            next(tilts)
+            assert not caught or time.monotonic() - begin > 1.9
+    (warning,) = caught
+    assert "no sensor othr" in str(warning.message) and "third" in str(warning.message), warning
+    assert "no sensor third" not in str(warning.message), warning
+    os.close(lock)
+
+
+def no_warning_after_the_end_of_a_hub() -> None:
+    lock = hub_without_topics()
+    with publish("third"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with publish("other") as mount:
+            tilts = scanhub.subscribe("other/tilt", "third/tilt", domain=domain, root=root, timeout=4)
+            while not mount.subscribers:
+                assert tilts._poll() is None
+            mount.send(angle_rad=0.25)
+            next(tilts)
+        os.close(lock)
+        refusal(scanhub.Failure, lambda: next(tilts))
+
+
+def no_notice_after_a_close() -> None:
+    def notice(kind: str) -> None:
+        notices.append(kind)
+        if kind == "hub_gone":
+            tilts.close()
+
+    notices: "list[str]" = []
+    lock = hub_without_topics()
+    tilts = scanhub.subscribe("other/tilt", domain=domain, root=root, on_notice=notice)
+    with publish("other"):
+        while not notices:
+            assert tilts._poll() is None
+        os.close(lock)
+        # The next check finds the end of one hub and the start of another.
+        lock = hub_without_topics(os.getppid())
+        while len(notices) < 2:
+            assert tilts._poll() is None
+        assert list(tilts) == [] and notices == ["hub_back", "hub_gone"], notices
     os.close(lock)
 
 
@@ -145,6 +201,9 @@ def warnings_of_a_robot() -> None:
             silent = scanhub.robot("othr", domain=domain, root=root)
             said = warning(what)
             assert "no sensor othr" in said and "the sensors are other" in said, said
+            silent = scanhub.robot(domain=domain, root=root)
+            said = warning(what)
+            assert "no sensor with zones" in said and "the sensors are other" in said, said
     os.close(lock)
 
 
@@ -206,6 +265,9 @@ for check in (
     a_taken_name,
     silence,
     reasons_of_a_silence,
+    a_silent_topic_beside_others,
+    no_warning_after_the_end_of_a_hub,
+    no_notice_after_a_close,
     warnings_in_asyncio,
     warnings_of_a_robot,
     duration_of_a_silence,

@@ -1,9 +1,10 @@
-"""Checks memory and lifetime of arrays, and threads, tasks and processes: arguments are domain and root. `front` has to
-stream."""
+"""Checks memory and lifetime of arrays, and threads, tasks and processes: arguments are domain and root, and `uvloop` to check only
+the tasks, in a loop of uvloop. `front` has to stream."""
 
 import asyncio
 import contextlib
 import gc
+import importlib
 import multiprocessing
 import os
 import pickle
@@ -249,7 +250,7 @@ def asyncio_waits_without_a_thread(_: scanhub.Subscription) -> None:
         closed.close()
         assert [scan async for scan in closed] == []
 
-    asyncio.run(follow())
+    run(follow())
 
 
 def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
@@ -280,7 +281,7 @@ def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
                 except StopAsyncIteration:
                     pass
 
-    asyncio.run(follow())
+    run(follow())
 
 
 def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
@@ -290,7 +291,7 @@ def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
         async for _ in scans:
             raise AssertionError("it was used by `for` before")
 
-    said = refuses(scanhub.Failure, lambda: asyncio.run(follow()))
+    said = refuses(scanhub.Failure, lambda: run(follow()))
     assert "async for" in said, said
 
 
@@ -319,8 +320,15 @@ def a_child_is_refused(scans: scanhub.Subscription) -> None:
     next(scans)
 
 
-domain, root = sys.argv[1:]
-for check in (
+TASKS = (
+    asyncio_waits_without_a_thread,
+    a_close_ends_the_wait_of_a_task,
+    a_subscription_has_one_kind_of_loop,
+)
+
+domain, root, *loop = sys.argv[1:]
+run = importlib.import_module(*loop).run if loop else asyncio.run
+for check in TASKS if loop else (
     views_are_the_hubs_memory,
     views_cannot_be_written,
     a_view_keeps_its_sample,
@@ -333,9 +341,7 @@ for check in (
     a_sample_is_dropped_while_another_thread_waits,
     two_threads_at_a_time_are_refused,
     ctrl_c_ends_a_wait,
-    asyncio_waits_without_a_thread,
-    a_close_ends_the_wait_of_a_task,
-    a_subscription_has_one_kind_of_loop,
+    *TASKS,
     a_child_of_multiprocessing_takes_nothing,
     a_child_is_refused,
 ):

@@ -768,7 +768,7 @@ static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned
     return range <= head->valid_to ? (double)range * head->unit_um / 1e6 : NAN;
 }
 
-/* The angle of beam i in radians, exact where the sensor says so; NAN for a sample that is none. */
+/* The angle of beam i in radians, exact where the sensor says so; NAN if the sample is not a scan. */
 static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
@@ -829,7 +829,7 @@ static inline int scanhub_is_incomplete(const struct scanhub_sample *scan)
     return head != NULL && (head->flags & 1) != 0;
 }
 
-/* The time at which beam i was measured, in ns of CLOCK_MONOTONIC; 0 for a sample that is none. */
+/* The time at which beam i was measured, in ns of CLOCK_MONOTONIC; 0 if the sample is not a scan. */
 static inline uint64_t scanhub_beam_stamp_ns(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
