@@ -45,7 +45,7 @@ fn poll<F: Follow>(
 ) -> PyResult<Option<F::Item>> {
     // The callback may close the subscription.
     while is_open(this) {
-        // First, because a topic without samples may be silent beside one that always has some.
+        // First, because a topic can be silent while another one always has samples.
         warn(py, this)?;
         let item = this.with(F::try_next).transpose()?.flatten();
         if item.is_some() || !notify(py, this, notice)? {

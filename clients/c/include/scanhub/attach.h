@@ -768,7 +768,7 @@ static inline double scanhub_range_m(const struct scanhub_sample *scan, unsigned
     return range <= head->valid_to ? (double)range * head->unit_um / 1e6 : NAN;
 }
 
-/* The angle of beam i in radians, exact where the sensor says so; NAN if the sample is not a scan. */
+/* The angle of beam i in radians, exact if the sensor reports it; NAN if the sample is not a scan. */
 static inline double scanhub_angle(const struct scanhub_sample *scan, unsigned i)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
