@@ -150,7 +150,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
     ) -> bool {
         let is_due = changed || now >= self.next_status;
         if is_due {
-            self.next_status = now + STATUS_PERIOD;
+            self.next_status = now.saturating_add(STATUS_PERIOD);
             let status = self.stats.status(session, self.output.topics.loan_failed(), now);
             self.output.topics.status(status, now);
             if changed || state != State::Streaming {
@@ -168,7 +168,7 @@ impl<'a, S: Platform> LinkCore<'a, S> {
 
     fn deliver_history(&mut self, now: Nanos) {
         if now >= self.next_history {
-            self.next_history = now + HISTORY_PERIOD;
+            self.next_history = now.saturating_add(HISTORY_PERIOD);
             self.output.topics.deliver_history();
         }
     }

@@ -26,7 +26,7 @@ use crate::control::CommandSender;
 use crate::link::LinkCore;
 use crate::platform::{Line, Platform, SavedState};
 use crate::player::Due;
-use crate::replay::{self, BEGIN, Lap, Pace, Recorded, ReplayLink, Shown};
+use crate::replay::{self, BEGIN, LATEST, Lap, Pace, Recorded, ReplayLink, Shown};
 use crate::replay_hub::RecordedSet;
 
 /// Options of a [`RecordingReader`].
@@ -108,6 +108,7 @@ impl RecordingReader {
             RecordedSet::new(recording, options.sensor, options.sources)?;
         let queue = Arc::new(Queue::default());
         let (boot, begin) = origin.and_then(|origin| origin.run).unwrap_or((0, BEGIN));
+        let begin = begin.min(LATEST);
         let begin_wall_ns = origin.map_or(begin, |origin| origin.wall_ns);
         let platform = |name: &str| MemoryPlatform {
             sensor: name.into(),
@@ -229,7 +230,7 @@ impl ReadLink<'_> {
                 let stale_at = self.replay.link.output.stale_at();
                 self.phase = match stale_at {
                     Nanos::MAX => Phase::Over,
-                    _ => Phase::Expiring(stale_at - platform.begin),
+                    _ => Phase::Expiring(stale_at.saturating_sub(platform.begin)),
                 };
             }
             Phase::Expiring(media) => {
@@ -285,7 +286,7 @@ struct MemoryPlatform {
 impl MemoryPlatform {
     /// Sets the clock to media time `media`, unless it is later already. Returns its time.
     fn advance(&self, media: Nanos) -> Nanos {
-        let now = self.begin.saturating_add(media).max(self.now());
+        let now = self.begin.saturating_add(media).min(LATEST).max(self.now());
         self.now.store(now, Ordering::Relaxed);
         now
     }
@@ -443,5 +444,118 @@ impl Line for Infallible {
 
     fn is_simulated(&self) -> bool {
         match *self {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::fs::File;
+
+    use scanhub_drivers::lms;
+    use scanhub_drivers::lms::variant::{Mode, Unit};
+    use scanhub_schema::MILLIS;
+    use scanhub_schema::file::Writer;
+    use tempfile::TempDir;
+
+    use super::*;
+
+    /// Times of the first and the last byte of a telegram, in ms.
+    type Times = (u64, u64);
+
+    fn read(file: &Path, topics: &[Topic]) -> Result<RecordingReader, Failure> {
+        let sources = Sources::default();
+        RecordingReader::open(&ReadOptions { file, sensor: None, family: None, sources: &sources, topics })
+    }
+
+    /// Writes a log of scans at `times`, in s.
+    fn write_log(file: &Path, times: &[f64]) {
+        let ranges = " 1.0".repeat(180);
+        let line = |time| format!("FLASER 180{ranges} 0 0 0 0 0 0 {time} host {time}\n");
+        std::fs::write(file, times.iter().map(line).collect::<String>()).unwrap();
+    }
+
+    /// Writes a recording of sensors, each with the times of its scans. The first telegram of a sensor has its mode.
+    fn write_mcap(file: &Path, sensors: &[(&str, Vec<Times>)]) {
+        let mut writer = Writer::begin(File::create(file).unwrap(), "", BTreeMap::new()).unwrap();
+        let mode = lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+        let scan = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
+        for (number, (name, scans)) in sensors.iter().enumerate() {
+            for (seq, (first_ms, last_ms)) in scans.iter().enumerate() {
+                let mut header = Header {
+                    seq: seq as u64,
+                    topic_seq: seq as u64,
+                    stamp_first_ns: first_ms.saturating_mul(MILLIS),
+                    stamp_last_ns: last_ms.saturating_mul(MILLIS),
+                    wall_ns: first_ms.saturating_add(1_000_000).saturating_mul(MILLIS),
+                    boot: 7,
+                    sensor: number as u8,
+                    period_us: 40_000,
+                    ..Header::default()
+                };
+                header.set_sent_at(last_ms.saturating_mul(MILLIS).saturating_add(100_000));
+                let telegram = if seq == 0 { &mode } else { &scan };
+                writer.sample(name, Topic::Telegram, &header, telegram.bytes()).unwrap();
+            }
+        }
+        writer.finish().unwrap();
+    }
+
+    #[test]
+    fn stamps_near_the_end_of_time_are_read() {
+        let folder = TempDir::new().unwrap();
+        let file = folder.path().join("a");
+        write_log(&file, &[5.0, 4.0, 1e18, 2.0]);
+        let topics: Vec<_> = RecordingReader::topics().collect();
+        let count = |topic| read(&file, &topics).unwrap().filter(|sample| sample.topic == topic).count();
+        assert_eq!(count(Topic::Scan), 4);
+        let last_ms = u64::MAX / MILLIS;
+        for begin_ms in [i64::MAX as u64 / MILLIS - 50, last_ms - 20, last_ms] {
+            let scans = (0..6).map(|at| begin_ms.saturating_add(at * 9)).map(|at| (at, at)).collect();
+            write_mcap(&file, &[("front", scans)]);
+            assert_eq!(count(Topic::Scan), 5, "{begin_ms}");
+        }
+    }
+
+    /// Returns for each sample its sensor, whether it is the verdict of a silent sensor, and its last stamp in ms.
+    fn order(file: &Path) -> Vec<(Arc<str>, bool, u64)> {
+        let samples = read(file, &[Topic::Scan, Topic::Zones]).unwrap();
+        let of = |sample: ReadSample| {
+            let is_verdict = sample.topic == Topic::Zones;
+            (sample.sensor, is_verdict, sample.header.stamp_last_ns / MILLIS)
+        };
+        let samples = samples.map(of);
+        // The verdict on a scan has the stamps of that scan.
+        let mut last = BTreeMap::new();
+        samples.filter(|(sensor, _, at)| last.insert(sensor.clone(), *at) != Some(*at)).collect()
+    }
+
+    #[test]
+    fn samples_come_in_the_order_of_their_last_bytes() {
+        let folder = TempDir::new().unwrap();
+        let file = folder.path().join("a.mcap");
+        // One of them sends for much longer than the other.
+        let slow = (0..20).map(|at| (1_000 + at * 200, 1_190 + at * 200)).collect();
+        let fast = (0..100).map(|at| (1_003 + at * 40, 1_006 + at * 40)).collect();
+        write_mcap(&file, &[("slow", slow), ("fast", fast)]);
+        let order = order(&file);
+        let ends: Vec<_> = order.iter().map(|(_, _, at)| *at).collect();
+        assert!(ends.is_sorted(), "{order:?}");
+        assert!(ends.len() >= 118, "{order:?}");
+    }
+
+    #[test]
+    fn verdict_of_a_silent_sensor_comes_when_it_is_stale() {
+        let folder = TempDir::new().unwrap();
+        let file = folder.path().join("a.mcap");
+        let every = |times: std::ops::Range<u64>| times.step_by(40).map(|at| (at, at + 14));
+        let front = every(1_000..2_000).chain(every(6_000..7_000)).collect();
+        write_mcap(&file, &[("front", front), ("rear", every(1_005..7_500).collect())]);
+        let order = order(&file);
+        let ends: Vec<_> = order.iter().map(|(_, _, at)| *at).collect();
+        assert!(ends.is_sorted(), "{order:?}");
+        let is_stale = |(sensor, is_verdict, _): &&(Arc<str>, bool, u64)| &**sensor == "front" && *is_verdict;
+        let stale: Vec<_> = order.iter().filter(is_stale).map(|(_, _, at)| *at).collect();
+        assert!(matches!(stale[..], [_, 1_980..2_500, 6_980..7_500]), "{stale:?}");
     }
 }

@@ -205,7 +205,7 @@ impl<'f> Lap<'f> {
 /// Keeps the last verdict valid for `lifetime` from now on. `None` means that there was none.
 fn expire_after<S: Platform>(replay: &mut ReplayLink<'_, S, impl Pace<S>>, lifetime: Option<Nanos>) {
     let now = replay.link.platform.now();
-    replay.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| now + lifetime));
+    replay.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| now.saturating_add(lifetime)));
 }
 
 impl<'a> ReplayLink<'a, System<'a>, PlayerPace<'_>> {
@@ -427,6 +427,8 @@ fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Playba
 
 /// Validity of a verdict while a recording plays: until the next verdict, even while the player waits.
 const VALID_UNTIL_NEXT: Nanos = Nanos::MAX - 1;
+/// Latest stamp. A later one in a file counts as this one, so that sums with durations do not overflow.
+pub(crate) const LATEST: Nanos = i64::MAX as Nanos - (1 << 56);
 /// Maximum recorded period that is accepted.
 const MAX_GAP: Nanos = 10_000 * MILLIS;
 /// Interval of the statuses while nothing plays.

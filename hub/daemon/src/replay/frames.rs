@@ -13,7 +13,7 @@ use scanhub_recording::{Frame, VirtualTime};
 use scanhub_schema::{Failure, Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::{Frames, Timeline};
-use super::{MAX_GAP, Pace, ReplayLink, VALID_UNTIL_NEXT};
+use super::{LATEST, MAX_GAP, Pace, ReplayLink, VALID_UNTIL_NEXT};
 use crate::link_output::{RecordedMetadata, micros, verdict_lifetime};
 use crate::platform::Platform;
 use crate::player::Due;
@@ -345,6 +345,7 @@ impl When {
         let begun = BEGIN.saturating_add(begin);
         let (first, last) =
             frame.header.map_or((begun, begun), |header| (header.stamp_first_ns, header.stamp_last_ns));
+        let (first, last) = (first.min(LATEST), last.min(LATEST));
         let took = last.saturating_sub(first);
         // A hub has a frame with its last byte.
         let media = begin.saturating_add(took.min(MAX_GAP));
