@@ -139,7 +139,7 @@ impl Recording {
         let mut read_for_a_while = |reader: &mut RecordingReader| {
             let until = Instant::now() + SIGNAL_INTERVAL;
             loop {
-                while let Some(sample) = reader.take() {
+                while let Some(sample) = reader.pop() {
                     if !take(sample) {
                         return false;
                     }

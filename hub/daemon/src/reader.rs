@@ -1,8 +1,8 @@
 //! Reads a recording without a hub: the code of a replay computes the samples, and this process has them in its memory.
 //!
 //! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for bit.
-//! Nothing waits, and there is no thread. [`RecordingReader::step`] plays the next telegram of the sensor that has the
-//! earliest one, and publishes its samples into a queue. Memory is for these samples, not for the file.
+//! The reader never waits and starts no thread. [`RecordingReader::step`] plays the next telegram of the sensor whose
+//! telegram ends first, and publishes its samples into a queue. Memory is for these samples, not for the file.
 
 use std::borrow::{Borrow, BorrowMut};
 use std::collections::VecDeque;
@@ -138,7 +138,7 @@ impl RecordingReader {
         damage.into_iter().chain(of_links.filter(|problem| !problem.is_empty())).collect()
     }
 
-    /// Plays the next telegram, or a few bytes of a stream. Returns whether there was any.
+    /// Plays the next telegram, or a few bytes of a stream. Returns false at the end of the recording.
     pub fn step(&mut self) -> bool {
         self.links.with_dependent_mut(|_, links| {
             let next = links.iter_mut().filter_map(|link| Some((link.next_media()?, link)));
@@ -149,18 +149,18 @@ impl RecordingReader {
     }
 
     /// Returns the oldest sample of the last steps that was not returned yet.
-    pub fn take(&mut self) -> Option<ReadSample> {
+    pub fn pop(&mut self) -> Option<ReadSample> {
         self.queue.0.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
     }
 }
 
-/// Samples are taken as long as there are any, one telegram after the other.
+/// Iterates over all samples. Plays the next telegram when the queue is empty.
 impl Iterator for RecordingReader {
     type Item = ReadSample;
 
     fn next(&mut self) -> Option<ReadSample> {
         loop {
-            if let Some(sample) = self.take() {
+            if let Some(sample) = self.pop() {
                 return Some(sample);
             }
             if !self.step() {
@@ -205,7 +205,7 @@ struct ReadLink<'a> {
 
 enum Phase<'a> {
     Playing(Lap<'a>),
-    /// All was played, and the last verdict becomes stale at this media time.
+    /// The recording has ended. The last verdict becomes stale at this media time.
     Expiring(Nanos),
     Over,
 }

@@ -184,7 +184,8 @@ impl<'f> Lap<'f> {
         }
     }
 
-    /// Plays the next telegram, or the next few bytes of a stream. Returns `None` if the hub must end.
+    /// Plays the next telegram, or the next few bytes of a stream. If the last verdict becomes stale before the next telegram ends,
+    /// only publishes that. Returns `None` if the hub must end.
     pub(crate) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
         match self {
             Lap::Bytes(lap) => lap.step(replay),

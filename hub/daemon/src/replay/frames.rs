@@ -103,13 +103,28 @@ impl<'f> FramesLap<'f> {
     }
 
     pub(super) fn next_media(&self) -> Option<Nanos> {
-        self.next.as_ref().map(|(_, media)| *media)
+        let when = self.next_when()?;
+        let stale = self.verdict.filter(|verdict| verdict.until_ns < when.last && !when.is_skipped);
+        Some(stale.map_or(when.media, |verdict| self.stale_at(&verdict, when)))
+    }
+
+    /// Returns the times of the next frame; `None` at the end.
+    fn next_when(&self) -> Option<When> {
+        let (frame, media) = self.next.as_ref()?;
+        Some(When::of(frame, *media, *media < self.start_ns))
+    }
+
+    /// Returns the media time at which `verdict` becomes stale, if the frame at `when` ends after it.
+    fn stale_at(&self, verdict: &Verdict, when: When) -> Nanos {
+        verdict.until.clamp(self.start_ns, when.media)
     }
 
     pub(super) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
-        let Some((frame, media)) = self.next.take() else { return Some(()) };
-        let when = When::of(&frame, media, media < self.start_ns);
-        self.note_silence(replay, when)?;
+        let Some(when) = self.next_when() else { return Some(()) };
+        if let Some(verdict) = self.verdict.take_if(|verdict| verdict.until_ns < when.last) {
+            return self.note_silence(replay, verdict, when);
+        }
+        let Some((frame, _)) = self.next.take() else { return Some(()) };
         self.note_run(replay, &frame, when);
         if self.frames.is_whole {
             let beams = self.play_telegram(replay, &frame, when)?;
@@ -127,7 +142,7 @@ impl<'f> FramesLap<'f> {
     pub(super) fn end<S: Platform>(&self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<Nanos> {
         if self.foreign > 0 {
             tracing::warn!(
-                "{}: {} telegrams are of a scanner of another family, and are not played: only those of family {} are",
+                "{}: {} telegrams are dropped, because their scanner is not of family {}",
                 replay.link.link.name,
                 self.foreign,
                 self.frames.family.name()
@@ -155,31 +170,29 @@ impl<'f> FramesLap<'f> {
         }
     }
 
-    /// Publishes that the last verdict is stale, if its validity ended before the frame at `when`. Returns `None` if
-    /// the hub must end.
+    /// Publishes that `verdict` is stale, which is not valid until the frame at `when`. Returns `None` if the hub must
+    /// end.
     fn note_silence<S: Platform>(
         &mut self,
         replay: &mut ReplayLink<'_, S, impl Pace<S>>,
+        verdict: Verdict,
         when: When,
     ) -> Option<()> {
-        let Some(silence) = self.verdict.take_if(|verdict| when.last > verdict.until_ns) else {
-            return Some(());
-        };
         if when.is_skipped {
             replay.link.output.note_silence();
             return Some(());
         }
-        let at = silence.until.clamp(self.start_ns, when.media);
+        let at = self.stale_at(&verdict, when);
         let due = replay.wait_turn(self.shown_session(), at, self.state)?;
         replay.link.output.publish_stale(due.at);
         // A scan that was lost on the line makes the verdict stale, and the sensor not silent.
-        if when.media.saturating_sub(silence.of) >= SILENCE.max(silence.until - silence.of) {
+        if when.media.saturating_sub(verdict.of) >= SILENCE.max(verdict.until - verdict.of) {
             self.state = State::Silent;
         }
         Some(())
     }
 
-    /// Forgets everything if another run of the hub recorded `frame`, because a hub knows nothing at its start.
+    /// Resets the processors if another run of the hub recorded `frame`, because a hub starts without learned data.
     fn note_run<S: Platform>(
         &mut self,
         replay: &mut ReplayLink<'_, S, impl Pace<S>>,
