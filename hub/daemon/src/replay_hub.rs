@@ -157,6 +157,14 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
         check_sensor(&link).map_err(|failure| Failure { kind: Kind::Usage, ..failure })?;
         return Ok(vec![Sensor::new(None, link, recording)]);
     }
+    let wanted = match wanted {
+        // Messages name the link of a remote sensor.
+        Some(wanted) if !names.iter().any(|name| name == wanted) => {
+            let recorded = names.iter().find(|name| link_name(name) == wanted);
+            Some(recorded.map_or(wanted, String::as_str))
+        }
+        wanted => wanted,
+    };
     if let Some(wanted) = wanted {
         recording.of(wanted)?;
     }
@@ -269,6 +277,14 @@ const MAX_NAME_LEN: usize = 24;
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+    use std::fs::File;
+
+    use scanhub_drivers::lms;
+    use scanhub_drivers::lms::variant::Unit;
+    use scanhub_schema::file::Writer;
+    use scanhub_schema::{Header, Topic};
+
     use super::*;
 
     fn sensor(name: &str) -> Sensor {
@@ -300,6 +316,31 @@ mod tests {
             (config.links.len(), config.links[0].rate(), left_out),
             (1, 38_400, vec!["up".to_owned()])
         );
+    }
+
+    #[test]
+    fn remote_sensor_is_chosen_by_either_name() {
+        let place = tempfile::NamedTempFile::new().unwrap().into_temp_path();
+        let mut writer = Writer::begin(File::create(&place).unwrap(), "", BTreeMap::new()).unwrap();
+        let telegram = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
+        for name in ["robot1.front", "a.b", "a-b"] {
+            writer.sample(name, Topic::Telegram, &Header::default(), telegram.bytes()).unwrap();
+        }
+        writer.finish().unwrap();
+        let recording = Recording::open(place.to_path_buf()).unwrap();
+        let recorded = |wanted| match &sensors(&recording, Some(wanted)).unwrap()[..] {
+            [only] => only.recorded.clone().unwrap(),
+            _ => panic!("{wanted}"),
+        };
+        for (wanted, name) in [
+            ("robot1.front", "robot1.front"),
+            ("robot1-front", "robot1.front"),
+            ("a.b", "a.b"),
+            ("a-b", "a-b"),
+        ] {
+            assert_eq!(recorded(wanted), name);
+        }
+        assert_eq!(sensors(&recording, Some("front")).err().unwrap().kind, Kind::NoTopic);
     }
 
     #[test]
