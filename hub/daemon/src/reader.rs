@@ -36,7 +36,7 @@ pub struct ReadOptions<'a> {
     pub file: &'a Path,
     /// Only sensor to read. For a recording that has no sensor names, the name that its sensor gets.
     pub sensor: Option<&'a str>,
-    /// Family of a stream file; `None` if it is recognized by the bytes.
+    /// Family of the scanners; `None` if it is recognized by the recording.
     pub family: Option<Family>,
     /// Configuration of its sensors.
     pub sources: &'a Sources,
@@ -106,6 +106,7 @@ impl RecordingReader {
         let recording = Recording::open_as(options.file, options.family)?;
         let RecordedSet { recording, config, parts, origin, .. } =
             RecordedSet::new(recording, options.sensor, options.sources)?;
+        check_family(options.family, &recording, &config, &parts)?;
         let queue = Arc::new(Queue::default());
         let (boot, begin) = origin.and_then(|origin| origin.run).unwrap_or((0, BEGIN));
         let begin = begin.min(LATEST);
@@ -134,8 +135,28 @@ impl RecordingReader {
         let damage = self.recording.contents().damage;
         let damage = (!damage.is_none()).then(|| format!("missing: {damage}"));
         let Parts { config, recorded, .. } = self.links.borrow_owner();
-        let of_links = recorded.iter().zip(&config.links).map(|(part, link)| part.problem(&link.name));
-        damage.into_iter().chain(of_links.filter(|problem| !problem.is_empty())).collect()
+        let of_links = recorded.iter().zip(&config.links).flat_map(|(part, link)| {
+            let problem = part.problem(&link.name);
+            let problem = (!problem.is_empty()).then(|| format!("{}: {problem}", link.name));
+            problem.into_iter().chain(part.losses(&link.name))
+        });
+        damage.into_iter().chain(of_links).collect()
+    }
+
+    /// Checks at the end of the recording that it was read to the end that the file had when it was opened.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the file has become shorter or unreadable.
+    pub fn check_end(&self) -> Result<(), Failure> {
+        let shortfall = self.links.with_dependent(|parts, links| {
+            let mut of_links = parts.config.links.iter().zip(links);
+            of_links.find_map(|(link, read)| Some((link.name.clone(), read.shortfall.clone()?)))
+        });
+        let Some((name, shortfall)) = shortfall else { return Ok(()) };
+        let place = self.recording.path().display();
+        let message = format!("recording {place} became shorter while it was read: {name} lacks {shortfall}");
+        Err(Failure::new(Kind::Input, message, "read it again when no program writes the file"))
     }
 
     /// Plays the next telegram, or a few bytes of a stream. Returns false at the end of the recording.
@@ -180,6 +201,25 @@ fn check(topic: Topic) -> Result<(), Failure> {
     Err(Failure::new(Kind::NoTopic, message, format!("the topics are {}", names.join(", "))))
 }
 
+/// Checks that the scanners are of family `named`, if the caller named one.
+fn check_family(
+    named: Option<Family>,
+    recording: &Recording,
+    config: &Config,
+    parts: &[Recorded],
+) -> Result<(), Failure> {
+    let mut of_links = config.links.iter().zip(parts);
+    let other = of_links.find(|(_, part)| named.is_some_and(|named| named != part.family()));
+    let (Some(named), Some((link, part))) = (named, other) else { return Ok(()) };
+    let (place, family) = (recording.path().display(), part.family().name());
+    let message = format!(
+        "the scanner of {} in recording {place} is of family {family}, and not {}",
+        link.name,
+        named.name()
+    );
+    Err(Failure::new(Kind::Configuration, message, format!("leave the family out, or name {family}")))
+}
+
 fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
     let Parts { config, recorded, platforms } = parts;
     let (_, queues) = CommandSender::new(config.links.iter().map(|link| link.name.as_str()))?;
@@ -192,7 +232,7 @@ fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
         let mut replay = ReplayLink::new(core, recorded, AtOnce);
         replay.set_begin(recorded);
         let lap = Lap::new(&replay, recorded)?;
-        links.push(ReadLink { replay, phase: Phase::Playing(lap) });
+        links.push(ReadLink { replay, phase: Phase::Playing(lap), shortfall: None });
     }
     Ok(links)
 }
@@ -201,6 +241,8 @@ fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
 struct ReadLink<'a> {
     replay: ReplayLink<'a, MemoryPlatform, AtOnce>,
     phase: Phase<'a>,
+    /// What the file lacked at its end, which it contained when it was opened.
+    shortfall: Option<String>,
 }
 
 enum Phase<'a> {
@@ -227,6 +269,7 @@ impl ReadLink<'_> {
             Phase::Playing(lap) if lap.next_media().is_some() => drop(lap.step(&mut self.replay)),
             Phase::Playing(lap) => {
                 lap.end(&mut self.replay);
+                self.shortfall = lap.shortfall();
                 let stale_at = self.replay.link.output.stale_at();
                 self.phase = match stale_at {
                     Nanos::MAX => Phase::Over,
@@ -496,6 +539,9 @@ mod tests {
                 header.set_sent_at(last_ms.saturating_mul(MILLIS).saturating_add(100_000));
                 let telegram = if seq == 0 { &mode } else { &scan };
                 writer.sample(name, Topic::Telegram, &header, telegram.bytes()).unwrap();
+                if seq % 100 == 99 {
+                    writer.close_chunk().unwrap();
+                }
             }
         }
         writer.finish().unwrap();
@@ -557,5 +603,56 @@ mod tests {
         let is_stale = |(sensor, is_verdict, _): &&(Arc<str>, bool, u64)| &**sensor == "front" && *is_verdict;
         let stale: Vec<_> = order.iter().filter(is_stale).map(|(_, _, at)| *at).collect();
         assert!(matches!(stale[..], [_, 1_980..2_500, 6_980..7_500]), "{stale:?}");
+    }
+
+    #[test]
+    fn file_that_becomes_shorter_is_an_error_at_its_end() {
+        let folder = TempDir::new().unwrap();
+        let (log, mcap) = (folder.path().join("a.log"), folder.path().join("a.mcap"));
+        write_log(&log, &(0..500).map(f64::from).collect::<Vec<_>>());
+        write_mcap(&mcap, &[("front", (0..3_000).map(|at| (at * 40, at * 40 + 14)).collect())]);
+        let telegram = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
+        let stream = folder.path().join("a.bin");
+        std::fs::write(&stream, telegram.bytes().repeat(2_000)).unwrap();
+        for (file, unit) in [(log, "telegrams"), (mcap, "telegrams"), (stream, "bytes")] {
+            let mut whole = read(&file, &[Topic::Telegram]).unwrap();
+            let count = whole.by_ref().count();
+            whole.check_end().unwrap();
+            let mut cut = read(&file, &[Topic::Telegram]).unwrap();
+            cut.next().unwrap();
+            let len = std::fs::metadata(&file).unwrap().len();
+            File::options().write(true).open(&file).unwrap().set_len(len / 2).unwrap();
+            assert!(cut.by_ref().count() < count - 1, "{unit}");
+            let failure = cut.check_end().unwrap_err();
+            assert_eq!(failure.kind, Kind::Input);
+            assert!(failure.message.ends_with(unit), "{failure}");
+        }
+    }
+
+    #[test]
+    fn what_is_left_out_is_a_problem() {
+        let folder = TempDir::new().unwrap();
+        let file = folder.path().join("a.log");
+        std::fs::write(&file, format!("FLASER 180{} 0 0 0 0 0 0 1 host 1\n", " 900.0".repeat(180))).unwrap();
+        let problems = read(&file, &[Topic::Scan]).unwrap().problems();
+        assert!(matches!(&problems[..], [only] if only.contains("180 ranges are too long")), "{problems:?}");
+    }
+
+    #[test]
+    fn family_that_is_not_that_of_the_bytes_is_refused() {
+        let folder = TempDir::new().unwrap();
+        let file = folder.path().join("a.bin");
+        let telegram = lms::measured::encode(0, Unit::Mm, &[1000; 181], 0x10);
+        std::fs::write(&file, telegram.bytes().repeat(20)).unwrap();
+        let sources = Sources::default();
+        let open = |family| {
+            let topics = &[Topic::Scan];
+            let options = ReadOptions { file: &file, sensor: None, family, sources: &sources, topics };
+            RecordingReader::open(&options)
+        };
+        assert_eq!(open(Some(Family::Lms)).unwrap().count(), 20);
+        let failure = open(Some(Family::Ld)).err().unwrap();
+        assert_eq!(failure.kind, Kind::Configuration);
+        assert!(failure.message.contains("family lms, and not ld"), "{failure}");
     }
 }

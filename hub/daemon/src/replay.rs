@@ -184,13 +184,22 @@ impl<'f> Lap<'f> {
         }
     }
 
-    /// Plays the next telegram, or the next few bytes of a stream. If the last verdict becomes stale before the next telegram ends,
-    /// only publishes that. Returns `None` if the hub must end.
+    /// Plays the next telegram, or the next few bytes of a stream. If the last verdict becomes stale before the next
+    /// telegram ends, only publishes that. Returns `None` if the hub must end.
     pub(crate) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
         match self {
             Lap::Bytes(lap) => lap.step(replay),
             Lap::Frames(lap) => lap.step(replay),
         }
+    }
+
+    /// Returns what the file lacks at the end of the pass, which it contained when it was opened.
+    pub(crate) fn shortfall(&self) -> Option<String> {
+        let (read, whole, unit) = match self {
+            Lap::Bytes(lap) => (lap.read_len, lap.stream.len(), "bytes"),
+            Lap::Frames(lap) => (lap.read_frames, lap.frames.count(), "telegrams"),
+        };
+        (read < whole).then(|| format!("{} of {whole} {unit}", whole - read))
     }
 
     /// Ends the pass. The last verdict stays valid for a while.

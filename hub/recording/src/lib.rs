@@ -116,6 +116,8 @@ pub struct Contents {
     pub sensors: Vec<String>,
     /// Number of whole telegrams; for a log, of scans.
     pub telegrams: u64,
+    /// Number of unpacked bytes of a stream; 0 for other forms.
+    pub bytes: u64,
     /// Number of telegrams with measured values (B0h).
     pub scans: u64,
     /// Times of the first and the last telegram, in ns since 1970, if there are stamps.

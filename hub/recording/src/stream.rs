@@ -17,6 +17,8 @@ use crate::{Contents, Form, Frame};
 pub(crate) struct StreamReader<R> {
     reader: R,
     framing: Framing,
+    /// Number of bytes that were read.
+    read_len: u64,
     /// Whether the reader is at its end.
     is_ended: bool,
 }
@@ -46,7 +48,7 @@ impl<R: Read> StreamReader<R> {
             let session = Session::begin(family, &settings, 0);
             Framing::Packets(Box::new(Packets { session, family, last: None, passed: 0 }))
         };
-        StreamReader { reader, framing, is_ended: false }
+        StreamReader { reader, framing, read_len: 0, is_ended: false }
     }
 
     /// Returns the number of bytes so far outside telegrams and packets. It is complete at the end.
@@ -84,6 +86,7 @@ impl<R: Read> StreamReader<R> {
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(error) => return Err(error),
             };
+            self.read_len += len as u64;
             self.is_ended = len == 0;
             match &mut self.framing {
                 Framing::Telegrams(framer) if self.is_ended => framer.release(VETO_HOLD),
@@ -163,6 +166,7 @@ pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Content
             Err(error) => return Err(unreadable(path, &error)),
         }
     }
+    contents.bytes = stream.read_len;
     contents.damage.bytes = stream.discarded();
     Ok(contents)
 }

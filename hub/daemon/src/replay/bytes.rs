@@ -14,8 +14,10 @@ use crate::platform::Platform;
 
 /// One pass through a stream.
 pub(crate) struct BytesLap<'f> {
-    stream: &'f Stream,
+    pub(super) stream: &'f Stream,
     bytes: Box<dyn Read + Send>,
+    /// Number of bytes that were read.
+    pub(super) read_len: u64,
     session: PortSession,
     recorded: RecordedMetadata,
     /// Media times between which telegrams are published.
@@ -45,6 +47,7 @@ impl<'f> BytesLap<'f> {
         Ok(BytesLap {
             stream,
             bytes: stream.bytes()?,
+            read_len: 0,
             session: PortSession::begin(Some(stream.family), &settings, None, link.platform.now()),
             recorded: RecordedMetadata::default(),
             start_ns,
@@ -62,7 +65,7 @@ impl<'f> BytesLap<'f> {
     }
 
     pub(super) fn step<S: Platform>(&mut self, replay: &mut ReplayLink<'_, S, impl Pace<S>>) -> Option<()> {
-        let BytesLap { stream, bytes, session, recorded, media, .. } = self;
+        let BytesLap { stream, bytes, read_len, session, recorded, media, .. } = self;
         let is_skipped = *media < self.start_ns;
         if is_skipped {
             if !replay.pass() {
@@ -74,6 +77,7 @@ impl<'f> BytesLap<'f> {
         let room = session.spare();
         let chunk_len = room.len().min(CHUNK_LEN);
         let len = read(&mut **bytes, &mut room[..chunk_len]);
+        *read_len += len as u64;
         let now = replay.link.platform.now();
         session.commit(now, len);
         if len == 0 {

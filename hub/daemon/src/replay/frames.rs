@@ -20,7 +20,7 @@ use crate::player::Due;
 
 /// One pass through telegrams or packets.
 pub(crate) struct FramesLap<'f> {
-    frames: &'f Frames,
+    pub(super) frames: &'f Frames,
     read: Peekable<Box<dyn Iterator<Item = Frame> + Send>>,
     timeline: Timeline,
     /// The next frame and its media time; `None` at the end.
@@ -28,6 +28,8 @@ pub(crate) struct FramesLap<'f> {
     /// Media times between which frames are published. Those before are only learned from.
     start_ns: Nanos,
     end_ns: Option<Nanos>,
+    /// Number of frames that were read.
+    pub(super) read_frames: u64,
     /// Frames of a scanner of another family.
     foreign: u64,
     /// Run of the hub that recorded the last frame.
@@ -88,6 +90,7 @@ impl<'f> FramesLap<'f> {
             next: None,
             start_ns,
             end_ns,
+            read_frames: 0,
             foreign: 0,
             run: None,
             has_begun: false,
@@ -158,6 +161,7 @@ impl<'f> FramesLap<'f> {
     fn advance(&mut self) {
         self.next = None;
         for frame in self.read.by_ref() {
+            self.read_frames += 1;
             if frame.header.is_some_and(|header| header.family != self.frames.family as u8) {
                 self.foreign += 1;
                 continue;

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use scanhub_config::Link;
 use scanhub_drivers::{Settings, features};
-use scanhub_recording::{Encoding, Form, Frame, Recording};
+use scanhub_recording::{Contents, Encoding, Form, Frame, Recording};
 use scanhub_schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::MAX_GAP;
@@ -111,7 +111,7 @@ impl Recorded {
     }
 
     /// Returns the family of the scanner.
-    pub(super) fn family(&self) -> Family {
+    pub(crate) fn family(&self) -> Family {
         match self {
             Recorded::Stream(stream) => stream.family,
             Recorded::Frames(frames) => frames.family,
@@ -160,6 +160,18 @@ impl Recorded {
         format!("the recording does not contain its measuring mode: no scans; set link.{name}.mode")
     }
 
+    /// Returns messages about data that a replay leaves out or changes.
+    pub(crate) fn losses(&self, name: &str) -> Vec<String> {
+        let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
+        let Contents { other_family, unencodable, .. } = recording.contents();
+        let foreign = other_family.map(|_| {
+            let family = self.family().name();
+            format!("{name}: telegrams are dropped, because their scanner is not of family {family}")
+        });
+        let unencodable = (!unencodable.is_none()).then(|| format!("{name}: {unencodable}"));
+        foreign.into_iter().chain(unencodable).collect()
+    }
+
     /// Returns the media time of its end, if it is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
         let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
@@ -189,6 +201,11 @@ impl Stream {
         self.recording.contents().telegrams > 0
     }
 
+    /// Returns the number of its bytes when it was opened.
+    pub(super) fn len(&self) -> u64 {
+        self.recording.contents().bytes
+    }
+
     /// Returns its bytes from the start.
     pub(super) fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         self.recording.bytes()
@@ -215,6 +232,11 @@ pub(super) fn read(bytes: &mut dyn Read, room: &mut [u8]) -> usize {
 }
 
 impl Frames {
+    /// Returns the number of its telegrams when it was opened.
+    pub(super) fn count(&self) -> u64 {
+        self.recording.contents().telegrams
+    }
+
     /// Returns its telegrams from the start.
     pub(super) fn read(&self) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         self.recording.telegrams(self.encoding)
