@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytemuck::cast_slice_mut;
-use scanhub_config::{Config, Sources};
+use scanhub_config::{Config, Link, Sources};
 use scanhub_port::{Allowance, Alteration, PortError, Source};
 use scanhub_recording::Recording;
 use scanhub_schema::{Failure, Family, Header, Kind, Nanos, Ring, Topic, Wake};
@@ -143,20 +143,22 @@ impl RecordingReader {
         damage.into_iter().chain(of_links).collect()
     }
 
-    /// Checks at the end of the recording that it was read to the end that the file had when it was opened.
-    ///
-    /// # Errors
-    ///
-    /// Returns [`Kind::Input`] if the file has become shorter or unreadable.
-    pub fn check_end(&self) -> Result<(), Failure> {
-        let shortfall = self.links.with_dependent(|parts, links| {
-            let mut of_links = parts.config.links.iter().zip(links);
-            of_links.find_map(|(link, read)| Some((link.name.clone(), read.shortfall.clone()?)))
+    /// Returns once, at the end of the recording, a failure if the file has become shorter or unreadable since it was
+    /// opened.
+    pub fn take_shortfall(&mut self) -> Option<Failure> {
+        let lacks: Vec<_> = self.links.with_dependent_mut(|parts, links| {
+            let of_links = parts.config.links.iter().zip(links);
+            let lacks = |(link, read): (&Link, &mut ReadLink<'_>)| {
+                read.shortfall.take().map(|shortfall| format!("{} lacks {shortfall}", link.name))
+            };
+            of_links.filter_map(lacks).collect()
         });
-        let Some((name, shortfall)) = shortfall else { return Ok(()) };
-        let place = self.recording.path().display();
-        let message = format!("recording {place} became shorter while it was read: {name} lacks {shortfall}");
-        Err(Failure::new(Kind::Input, message, "read it again when no program writes the file"))
+        if lacks.is_empty() {
+            return None;
+        }
+        let (place, lacks) = (self.recording.path().display(), lacks.join(", "));
+        let message = format!("recording {place} became shorter while it was read: {lacks}");
+        Some(Failure::new(Kind::Input, message, "read it again when no program writes the file"))
     }
 
     /// Plays the next telegram, or a few bytes of a stream. Returns false at the end of the recording.
@@ -241,7 +243,7 @@ fn links(parts: &Parts, boot: u64) -> Result<Links<'_>, Failure> {
 struct ReadLink<'a> {
     replay: ReplayLink<'a, MemoryPlatform, AtOnce>,
     phase: Phase<'a>,
-    /// What the file lacked at its end, which it contained when it was opened.
+    /// Data that the file contained when it was opened, and lacked at the end of the reading.
     shortfall: Option<String>,
 }
 
@@ -617,15 +619,16 @@ mod tests {
         for (file, unit) in [(log, "telegrams"), (mcap, "telegrams"), (stream, "bytes")] {
             let mut whole = read(&file, &[Topic::Telegram]).unwrap();
             let count = whole.by_ref().count();
-            whole.check_end().unwrap();
+            assert!(whole.take_shortfall().is_none());
             let mut cut = read(&file, &[Topic::Telegram]).unwrap();
             cut.next().unwrap();
             let len = std::fs::metadata(&file).unwrap().len();
             File::options().write(true).open(&file).unwrap().set_len(len / 2).unwrap();
             assert!(cut.by_ref().count() < count - 1, "{unit}");
-            let failure = cut.check_end().unwrap_err();
+            let failure = cut.take_shortfall().unwrap();
             assert_eq!(failure.kind, Kind::Input);
             assert!(failure.message.ends_with(unit), "{failure}");
+            assert!(cut.take_shortfall().is_none());
         }
     }
 

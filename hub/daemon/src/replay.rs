@@ -193,7 +193,8 @@ impl<'f> Lap<'f> {
         }
     }
 
-    /// Returns what the file lacks at the end of the pass, which it contained when it was opened.
+    /// Returns the number of telegrams or bytes that the file contained when it was opened, and lacked in this pass. `None`
+    /// if it was read to its end.
     pub(crate) fn shortfall(&self) -> Option<String> {
         let (read, whole, unit) = match self {
             Lap::Bytes(lap) => (lap.read_len, lap.stream.len(), "bytes"),
