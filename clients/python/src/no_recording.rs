@@ -1,4 +1,4 @@
-//! Takes the place of `recording.rs` in a build without the feature `read`.
+//! Replaces `recording.rs` in builds without the feature `read`.
 
 use std::path::PathBuf;
 
@@ -20,6 +20,8 @@ impl Recording {
         sensor: Option<String>,
         config: Option<PathBuf>,
         family: Option<String>,
+        set: Vec<String>,
+        system_config: bool,
     ) -> Result<Recording, Error> {
         let what = "this build of the package scanhub does not read recordings";
         Err(Error::new(

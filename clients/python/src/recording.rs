@@ -29,6 +29,7 @@ pub(crate) struct Recording {
 #[pymethods]
 impl Recording {
     #[new]
+    #[expect(clippy::too_many_arguments, reason = "they are the arguments of `scanhub.read`")]
     fn new(
         py: Python<'_>,
         file: PathBuf,
@@ -36,6 +37,8 @@ impl Recording {
         sensor: Option<String>,
         config: Option<PathBuf>,
         family: Option<String>,
+        set: Vec<String>,
+        system_config: bool,
     ) -> PyResult<Recording> {
         let topics = topics.iter().map(|name| parse(name)).collect::<Result<Vec<_>, _>>()?;
         if topics.is_empty() {
@@ -52,16 +55,18 @@ impl Recording {
         let family = family.transpose()?;
         let (place, read) = (file.clone(), topics.clone());
         let opened = interruptible(py, move || {
-            let mut sources = Sources { files: Sources::system(), ..Sources::default() };
-            // As the program has it.
-            sources.files.extend(config.or_else(|| std::env::var_os("SCANHUB_CONFIG").map(PathBuf::from)));
+            // The same default as `scanhub replay`.
+            let named = || std::env::var_os("SCANHUB_CONFIG").filter(|file| !file.is_empty());
+            let mut files = if system_config { Sources::system() } else { Vec::new() };
+            files.extend(config.or_else(|| named().map(PathBuf::from)));
+            let sources = Sources { files, set, ..Sources::default() };
             let sensor = sensor.as_deref();
             let options = ReadOptions { file: &place, sensor, family, sources: &sources, topics: &read };
             RecordingReader::open(&options)
         })?;
         let reader = opened.map_err(refusal)?;
         let sensors = reader.sensors().into_iter().map(str::to_owned).collect();
-        let problems = reader.problems();
+        let problems = reader.problems().iter().map(|problem| in_python(problem)).collect();
         Ok(Recording { reader: Confined::new(reader), file, topics, sensors, problems })
     }
 
@@ -84,7 +89,8 @@ impl Recording {
     fn __next__(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
         let _reserved = self.reader.reserve()?;
         let mut next = None;
-        self.read(py, |sample| {
+        // The iteration of a closed recording ends.
+        let _is_open = self.read(py, |sample| {
             next = Some(sample);
             false
         })?;
@@ -105,18 +111,22 @@ impl Recording {
             return Err(Error::new("Impossible", what, "add \"scan\" to topics").into());
         }
         let mut scans = Scans::default();
-        self.read(py, |sample| {
+        let is_open = self.read(py, |sample| {
             if sample.topic == Topic::Scan {
                 scans.push(sample.header.stamp_first_ns, Scan::of_words(cast_slice(&sample.words)));
             }
             true
         })?;
+        if !is_open {
+            let what = format!("the recording {place} is closed");
+            return Err(Error::new("Failure", what, "call scanhub.read again").into());
+        }
         scans.into_numpy(py).map(Bound::unbind)
     }
 
     /// Closes the file. The iteration then ends.
-    fn close(&self) {
-        drop(self.reader.take());
+    fn close(&self, py: Python<'_>) {
+        py.detach(|| drop(self.reader.take()));
     }
 
     fn __enter__(slf: Py<Self>) -> Py<Self> {
@@ -124,8 +134,8 @@ impl Recording {
     }
 
     #[pyo3(signature = (*_error))]
-    fn __exit__(&self, _error: &Bound<'_, PyTuple>) {
-        self.close();
+    fn __exit__(&self, py: Python<'_>, _error: &Bound<'_, PyTuple>) {
+        self.close(py);
     }
 
     fn __repr__(&self) -> String {
@@ -134,28 +144,34 @@ impl Recording {
 }
 
 impl Recording {
-    /// Passes samples to `take` until it returns false, or to the end. Handles signals in between.
-    fn read(&self, py: Python<'_>, mut take: impl FnMut(ReadSample) -> bool + Send) -> PyResult<()> {
+    /// Passes samples to `take` until it returns false, or to the end. Handles signals in between. Returns false if the
+    /// recording is closed. Fails once if the file has become shorter.
+    fn read(&self, py: Python<'_>, mut take: impl FnMut(ReadSample) -> bool + Send) -> PyResult<bool> {
         let mut read_for_a_while = |reader: &mut RecordingReader| {
             let until = Instant::now() + SIGNAL_INTERVAL;
             loop {
                 while let Some(sample) = reader.pop() {
                     if !take(sample) {
-                        return false;
+                        return Ok(false);
                     }
                 }
                 if !reader.step() {
-                    return false;
+                    return reader.take_shortfall().map_or(Ok(false), Err);
                 }
                 if Instant::now() >= until {
-                    return true;
+                    return Ok(true);
                 }
             }
         };
-        while py.detach(|| self.reader.with(&mut read_for_a_while)) == Some(true) {
+        loop {
+            let Some(continues) = py.detach(|| self.reader.with(&mut read_for_a_while)) else {
+                return Ok(false);
+            };
+            if !continues.map_err(refusal)? {
+                return Ok(true);
+            }
             py.check_signals()?;
         }
-        Ok(())
     }
 }
 
@@ -173,18 +189,43 @@ fn sample_of(sample: ReadSample) -> Sample {
     Sample { name: Name { sensor, topic }, header, missed: 0, restarted: false, stale: false, memory }
 }
 
-/// Returns the error for a recording that was not opened.
+/// Returns the error for a recording that cannot be read. Its message and remedy name arguments of Python.
 fn refusal(failure: Failure) -> Error {
+    let (message, hint) = (in_python(&failure.message), in_python(&failure.hint));
     match failure.kind {
-        Kind::Input => Error::new("Unreadable", failure.message, failure.hint),
-        _ => failure.into(),
+        Kind::Input => Error::new("Unreadable", message, hint),
+        _ => Failure { message, hint, ..failure }.into(),
     }
+}
+
+/// Returns `text` with arguments of `scanhub.read` in place of options of the program.
+fn in_python(text: &str) -> String {
+    let text = text
+        .replace("play one of them: --sensor NAME", "read one of them: sensor=\"NAME\"")
+        .replace("--family NAME of the command", "family=\"NAME\" of scanhub.read")
+        .replace("`scanhub replay` plays it where", "scanhub.read reads it if")
+        .replace("--set link.", "set link.");
+    let mut parts = text.split("set link.");
+    let mut python = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        // A key, and maybe its value.
+        let len = part.find([' ', ',', ';', ':']).unwrap_or(part.len());
+        let (setting, rest) = part.split_at(len);
+        let (value, rest) = match rest.strip_prefix(" = \"").and_then(|rest| rest.split_once('"')) {
+            Some((value, rest)) => (format!("={value}"), rest),
+            None => ((if setting.contains('=') { "" } else { "=VALUE" }).to_owned(), rest),
+        };
+        python += &format!("set=[\"link.{setting}{value}\"]{rest}");
+    }
+    python
 }
 
 /// Scans as rows of arrays. Rows are as long as the longest one, and filled up with NaN.
 #[derive(Default)]
 struct Scans {
     stamps: Vec<i64>,
+    /// Number of beams of each scan.
+    beams: Vec<usize>,
     ranges: Rows,
     angles: Angles,
 }
@@ -203,6 +244,7 @@ impl Scans {
     fn push(&mut self, stamp_ns: u64, scan: &Scan) {
         let beams = scan.beams();
         self.stamps.push(stamp_ns as i64);
+        self.beams.push(beams);
         self.ranges.push(beams, (0..beams).map(|i| scan.distance_m(i).unwrap_or(f64::NAN)));
         let is_exact = scan.contents & Contents::ANGLES != 0;
         let angles = (0..beams).map(|i| scan.angle(i));
@@ -216,8 +258,8 @@ impl Scans {
             before => {
                 let mut rows = Rows::default();
                 if let Angles::Same(_, _, same) = &before {
-                    for _ in 1..self.stamps.len() {
-                        rows.push(same.len(), same.iter().copied());
+                    for &len in &self.beams[..self.beams.len() - 1] {
+                        rows.push(len, same[..len].iter().copied());
                     }
                 } else if !is_exact {
                     *before = Angles::Same(scan.first_angle, scan.step, angles.collect());
@@ -259,9 +301,9 @@ impl Rows {
 
     fn widen(&mut self, width: usize) {
         let mut values = Vec::with_capacity((self.count + 1) * width);
-        for row in self.values.chunks(self.width.max(1)) {
-            values.extend_from_slice(row);
-            values.resize(values.len() + width - self.width, f64::NAN);
+        for row in 0..self.count {
+            values.extend_from_slice(&self.values[row * self.width..][..self.width]);
+            values.resize((row + 1) * width, f64::NAN);
         }
         (self.values, self.width) = (values, width);
     }

@@ -104,7 +104,79 @@ def what_cannot_be_read() -> None:
     wrong = write("wrong.toml", b"zones.radius = [1]\n")
     refusal(scanhub.Impossible, wrong, "`radius`", "radii", file=log, config=wrong)
     other = write("other.toml", b'[[link]]\nname = "front"\nport = "/dev/x"\nfamily = "ld"\n')
-    refusal(scanhub.Impossible, "family lms", "family ld", file=two, config=other)
+    remedy = 'set=["link.front.family=lms"]'
+    refusal(scanhub.Impossible, "family lms", "family ld", remedy, file=two, config=other)
+    assert scanhub.read(two, sensor="front", config=other, set=["link.front.family=lms"]).to_numpy().stamps.size > 100
+    refusal(scanhub.Impossible, "family lms, and not ld", "leave the family out", file=log, family="ld")
+    refusal(scanhub.Impossible, 'set=["link.front.prot=1"]: unknown key', "port", file=log, set="link.front.prot=1")
+
+
+def warned(**what) -> "tuple[scanhub.Recording, list[str]]":
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        return scanhub.read(**what), [str(warning.message) for warning in caught]
+
+
+def remedies_are_what_python_takes() -> None:
+    no_mode = os.path.join(place, "no_mode.bin")
+    recording, (warning,) = warned(file=no_mode)
+    assert 'no scans; set=["link.front.mode=VALUE"]' in warning and not list(recording), warning
+    recording, caught = warned(file=no_mode, set=["link.front.mode=1"], system_config=False)
+    assert not caught and recording.to_numpy().ranges.shape == (9, 181)
+    # The name of a remote sensor, and that of its link.
+    remote = os.path.join(place, "remote.mcap")
+    names = scanhub.read(remote).sensors
+    assert names == ("robot1-front", "robot1-rear")
+    refusal(scanhub.Impossible, 'sensor="robot1-front"', file=remote)
+    lengths = [scanhub.read(remote, sensor=name).to_numpy().stamps.size for name in (*names, "robot1.front")]
+    assert lengths[0] == lengths[2] > 20, lengths
+    os.environ["SCANHUB_CONFIG"] = ""
+    assert len(list(scanhub.read(log))) > 50
+    del os.environ["SCANHUB_CONFIG"]
+
+
+def closed_recordings_say_so() -> None:
+    def refused(recording: scanhub.Recording) -> None:
+        try:
+            recording.to_numpy()
+        except scanhub.Failure as closed:
+            assert "is closed" in str(closed) and closed.remedy == "call scanhub.read again", closed
+            return
+        raise AssertionError("to_numpy of a closed recording")
+
+    with scanhub.read(log) as recording:
+        next(recording)
+    refused(recording)
+    assert list(recording) == []
+    long = scanhub.read(write("long.log", read_bytes(log) * 60), topics=["scan", "lines", "motion", "foreground"])
+    threading.Timer(0.1, long.close).start()
+    refused(long)
+
+
+def file_that_becomes_shorter_is_unreadable() -> None:
+    for take in (list, scanhub.Recording.to_numpy):
+        cut = write("cut.log", read_bytes(log) * 10)
+        recording = scanhub.read(cut)
+        next(recording)
+        os.truncate(cut, os.path.getsize(cut) // 2)
+        try:
+            take(recording)
+        except scanhub.Unreadable as short:
+            assert f"{cut} became shorter" in str(short) and "front lacks " in str(short) and short.remedy, short
+        else:
+            raise AssertionError("nothing was missing")
+        assert list(recording) == []
+
+
+def missing_beams_have_no_angle() -> None:
+    counts = (181, 361, 181)
+    lines = [f"FLASER {n} {'1.0 ' * n}0 0 0 0 0 0 {at} host {at}\n" for at, n in enumerate(counts)]
+    file = write("var.log", "".join(lines).encode())
+    ranges, _, angles = scanhub.read(file).to_numpy()
+    assert ranges.shape == angles.shape == (3, 361)
+    for row, scan in enumerate(scanhub.read(file)):
+        assert scan.count == counts[row] and np.array_equal(angles[row, : scan.count], scan.angles)
+        assert np.isnan(angles[row, scan.count :]).all() and np.isnan(ranges[row, scan.count :]).all()
 
 
 def damage_is_a_warning() -> None:
@@ -137,7 +209,7 @@ def one_thread_at_a_time_and_no_child() -> None:
 
 
 def control_c_ends_it() -> None:
-    long = write("long.log", b"".join(open(log, "rb").read() for _ in range(60)))
+    long = write("long.log", read_bytes(log) * 60)
     recording = scanhub.read(long, topics=["scan", "lines", "motion", "foreground"])
     sent = []
 
@@ -156,6 +228,11 @@ def control_c_ends_it() -> None:
         raise AssertionError("the recording is too short for this machine")
 
 
+def read_bytes(path: str) -> bytes:
+    with open(path, "rb") as file:
+        return file.read()
+
+
 def write(name: str, content: bytes) -> str:
     path = os.path.join(place, name)
     with open(path, "wb") as file:
@@ -172,6 +249,10 @@ for check in (
     arrays_have_all_scans,
     settings_change_the_results,
     what_cannot_be_read,
+    remedies_are_what_python_takes,
+    closed_recordings_say_so,
+    file_that_becomes_shorter_is_unreadable,
+    missing_beams_have_no_angle,
     damage_is_a_warning,
     one_thread_at_a_time_and_no_child,
     control_c_ends_it,

@@ -196,6 +196,9 @@ fn arrays_and_errors() {
     let Some(mut read) = check("read") else { return };
     let env = TestEnv::new();
     let world = "room".parse().expect("a world");
+    let remote = recorded_world(&env, &world, &["robot1.front", "robot1.rear"], 1);
+    std::fs::rename(remote, env.path("remote.mcap")).expect("a file");
+    env.file("no_mode.bin", lms::measured::encode(0, Unit::Mm, &[0x2345; 181], 0x10).bytes().repeat(9));
     let two = recorded_world(&env, &world, &["front", "rear"], 4);
     read.args(["check", &two, &log(&env), &packets(&env)]).arg(env.path(""));
     passed(read);

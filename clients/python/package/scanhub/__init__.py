@@ -315,16 +315,21 @@ def read(
     sensor: str | None = None,
     config: str | os.PathLike[str] | None = None,
     family: str | None = None,
+    set: str | Iterable[str] = (),
+    system_config: bool = True,
 ) -> Recording:
     """Reads `topics` of a recording: an MCAP file, a CARMEN log or a stream of telegrams. No hub is needed. The samples equal
-    those of `scanhub replay --rate max`, with the settings in the file `config`.
+    those of `scanhub replay --rate max`, with the settings in the file `config` and those in `set`, as in
+    `set=["link.front.mode=1"]`. With `system_config=False`, the files in /etc/scanhub are not read.
 
     Iterate over the result, or call its `to_numpy()`. `sensor` selects one of several sensors, or names the sensor of a recording
     without names. `family` is the family of the scanner that sent a stream (None: recognized by the bytes). Warns with
     RecordingWarning if something is missing in the file. Raises Unreadable, NoTopic, or Impossible for a wrong configuration.
+    The iteration raises Unreadable at its end if the file became shorter in the meantime.
     """
     names = (topics,) if isinstance(topics, str) else tuple(topics)
-    recording = Recording(file, names, sensor, config, family)
+    settings = (set,) if isinstance(set, str) else tuple(set)
+    recording = Recording(file, names, sensor, config, family, settings, system_config)
     for problem in recording._problems:
         warnings.warn(f"{os.fspath(file)}: {problem}", RecordingWarning, stacklevel=2)
     return recording
