@@ -99,7 +99,7 @@ fn a_recording_is_played_with_the_beams_that_were_recorded_and_telegrams_of_anot
     assert_eq!((text(&scan, "family"), &scan["count"]), ("rplidar", &1079.into()));
     env.await_info("front", |info| info["state"] == "silent");
     let log = played.end(TERM).errors;
-    assert!(log.contains("telegrams are of a scanner of another family"), "{log}");
+    assert!(log.contains("telegrams are dropped, because their scanner is not of family rplidar"), "{log}");
 }
 
 #[test]
