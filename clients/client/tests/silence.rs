@@ -70,7 +70,7 @@ fn the_state_of_the_link_is_the_reason() {
         });
     };
     is(State::Paused, &|silence| {
-        matches!(silence, Silence::Paused { .. }) && silence.remedy().contains("resume front")
+        matches!(silence, Silence::Paused { .. }) && silence.remedy() == "scanhub control front resume"
     });
     is(State::Absent, &|silence| {
         matches!(silence, Silence::Absent { state: State::Absent, .. })
