@@ -50,7 +50,7 @@ fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Ve
             telegrams
         },
     );
-    // What is said at the start, and what may have been said already of the silence after the end, is no telegram's.
+    // Samples before the first telegram, and those of the silence after the end, belong to no telegram.
     let is_around = |it: &Published| it.header.hub_time_ns().is_none() && [0, SCANS].contains(&it.header.seq);
     published.iter_mut().for_each(|published| published.retain(|it| !is_around(it)));
     published

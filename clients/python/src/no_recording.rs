@@ -1,8 +1,7 @@
 //! Replaces `recording.rs` in builds without the feature `read`.
 
-use std::path::PathBuf;
-
 use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
 
 use crate::error::Error;
 
@@ -13,21 +12,10 @@ pub(crate) struct Recording;
 #[pymethods]
 impl Recording {
     #[new]
-    #[expect(unused_variables, reason = "the arguments are those of the class that reads")]
-    fn new(
-        file: PathBuf,
-        topics: Vec<String>,
-        sensor: Option<String>,
-        config: Option<PathBuf>,
-        family: Option<String>,
-        set: Vec<String>,
-        system_config: bool,
-    ) -> Result<Recording, Error> {
+    #[pyo3(signature = (*_args, **_kwargs))]
+    fn new(_args: &Bound<'_, PyTuple>, _kwargs: Option<&Bound<'_, PyDict>>) -> Result<Recording, Error> {
         let what = "this build of the package scanhub does not read recordings";
-        Err(Error::new(
-            "Failure",
-            what,
-            "install a wheel of the project, or build with the Cargo feature read",
-        ))
+        let remedy = "install a wheel of the project, or build with the Cargo feature read";
+        Err(Error::new("Failure", what, remedy))
     }
 }

@@ -1,4 +1,5 @@
-//! Reads a recording without a hub: the code of a replay computes the samples, and this process has them in its memory.
+//! Reader of a recording that needs no hub. The code of a replay computes the samples, and they stay in the memory of this
+//! process.
 //!
 //! A link plays each sensor, as in [`replay`](fn@crate::replay) at maximum rate, so that payloads are equal bit for bit.
 //! The reader never waits and starts no thread. [`RecordingReader::step`] plays the next telegram of the sensor whose
@@ -407,7 +408,7 @@ impl Platform for MemoryPlatform {
 /// A topic in the memory of this process.
 struct MemoryTopic<P: ?Sized> {
     sensor: Arc<str>,
-    /// Queue of the only subscriber, if there is one.
+    /// Queue of the only subscriber; `None` without a subscriber.
     queue: Option<Arc<Queue>>,
     payload: PhantomData<fn(&P)>,
 }

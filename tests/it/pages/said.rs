@@ -47,7 +47,7 @@ fn wrong_with(block: &Block) -> Option<String> {
         "json5" if block.place.starts_with("docs/bridge.md") => None,
         // What publishes angles: `tilt.rs` runs it.
         "rust,no_run" if block.place.starts_with("docs/tilt.md") => None,
-        // Of a recording: `python/read.rs` runs it.
+        // It reads a recording: `python/read.rs` runs it.
         "python,no_run" if block.place.starts_with("docs/python.md") => None,
         // Of a crate that consumers of topics do not have: its own tests run it.
         "rust,edition2024" if block.place.starts_with("docs/tilt.md") => None,
