@@ -18,7 +18,7 @@ const TEXTS: [(&str, &str, &str); 8] = [
     ("docs/ros2.md", "sudo apt-get install ros-", "ROS is not installed where tests run"),
     ("docs/ros2.md", "scanhub bridge --connect", "clients/bridge/tests/bridge/ros2.rs runs it"),
     ("docs/tracks.md", "1 appeared in hall", "tests/it/track_page.rs reads it"),
-    ("docs/tracks.md", "empty rooms: ", "figures, which the example `proof` prints"),
+    ("docs/measured.md", "empty rooms: ", "figures, which the example `proof` prints"),
     ("docs/worlds.md", "w.toml:2:1: unknown key", "a_wrong_world_is_refused_as_the_page_says"),
 ];
 
