@@ -93,7 +93,7 @@ impl Model {
         }
     }
 
-    /// Returns the default number of beams, which was chosen by measurement (docs/scanners.md).
+    /// Returns the default number of beams, which was chosen by measurement (docs/measured.md).
     pub const fn beams(self) -> usize {
         match self {
             Model::Stl27l => 2_160,

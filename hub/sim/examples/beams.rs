@@ -1,6 +1,6 @@
 //! How many beams a grid for each model of a turning scanner should have: what share of its points find their bin taken,
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
-//! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
+//! tables of docs/measured.md: `cargo run --release -p scanhub-sim --example beams`.
 
 use scanhub_drivers::line::{Event, Output, Session};
 use scanhub_drivers::line::{Grid, NOT_MEASURED, Point};

@@ -1,6 +1,6 @@
 //! What the turns of scanners whose heads turn are like behind the whole hub, in virtual time: each model, in each mode, for ten
 //! minutes, a hundred lines that lose bytes in bursts, a hundred hubs that stand still for half a second again and again, and
-//! how soon a scanner streams that was found in any state. The figures of docs/scanners.md:
+//! how soon a scanner streams that was found in any state. The figures of docs/measured.md:
 //! `cargo run --release -p scanhub-world --example turns`; with words behind `--`, only those tables whose names begin so.
 
 use std::fmt::Write as _;
