@@ -3,6 +3,10 @@
 //! two sensors. The baseline is a bare chain with the same late read: pty, process, eventfd, process. Sent and received
 //! telegrams are matched by hash. Hub, baselines and, with `--beside PROGRAM`, the hub of another build run at the same
 //! time (`support/simultaneous.rs`). The bench does not measure when a beam was measured, or what an adapter adds.
+//!
+//! The path up to the last byte is that of the baseline, so the difference lies between the read and the subscriber.
+//! The 99th percentile and the maximum depend on the machine as much as on the hub, because the simulator runs on the
+//! same cores.
 
 mod support;
 

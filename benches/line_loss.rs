@@ -2,6 +2,9 @@
 //! are lost in bursts, read by three parsers. A telegram that the line damaged cannot be restored; whatever else is
 //! missing, the parser discarded. `--count N` sets the number of telegrams, `--pairs N` that of lines.
 //! `hub/drivers/tests/lms/framing.rs` checks the same in other surroundings.
+//!
+//! A damaged telegram lost at least one byte. A collateral telegram arrived with every byte, and the parser discarded
+//! it. The paper lost 0.135 % of the bytes and 40.8 % of the telegrams.
 
 #[path = "../hub/drivers/tests/lms/line.rs"]
 #[allow(dead_code)] // The test uses the other surroundings.

@@ -21,6 +21,9 @@
 //! threads of the kernel do for a pty, which is more where there are more ptys: another table shows these.
 //!
 //! The bench does not measure what a real UART costs: a pty has no interrupts. It needs an otherwise idle machine.
+//!
+//! Figures are shares of one processor. A rate below 37.5 Hz means that the setup fell behind: its load is that of an
+//! overloaded machine.
 
 mod consumer;
 mod cpu_time;

@@ -8,6 +8,8 @@
 //! - how long the datagrams of scans are
 //!
 //! The bench does not measure what a real switch does.
+//!
+//! After a link was down, the kernel sends no datagram until its link watch has run, up to a second later.
 
 #[path = "../../tests/testkit/child.rs"]
 mod child;

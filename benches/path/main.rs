@@ -20,6 +20,9 @@
 //!
 //! With `SCANHUB_WRITE=1`, the bench also writes the order of functions for the linker, `hub/path.lds`. Entries for
 //! functions that no longer exist do no harm, so write it again only if the path has changed much.
+//!
+//! A code line or page counts once per telegram, and once in each stage, crate and function that uses it, so parts
+//! sum to more than the total. Code without a known function belongs to the stage of its caller.
 #![cfg_attr(not(target_arch = "x86_64"), allow(unused))]
 
 #[cfg(target_arch = "x86_64")]

@@ -8,6 +8,11 @@
 //!
 //! Recall is the share of the foreground beams that are found, precision the share of the reported beams that are
 //! right. Wrong beams are per scan, over all 2000 scans including the first ones.
+//!
+//! A person who stands in the room at the start is learned, and no method finds this person while standing. The crowd
+//! is also present from the start. A person behind a door that has just opened is farther away than the door was, so
+//! no method finds this person either. Bytes are payloads on a network; an empty foreground has 58 of them. In the
+//! room of Fig. 8, a person is present for 40 % of the time.
 
 use std::ops::Range;
 

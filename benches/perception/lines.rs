@@ -4,6 +4,10 @@
 //!
 //! J vertices make J - 1 lines. The ratio is to iterative end-point fit on the same scans, as in PLE's publication, and
 //! the target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
+//!
+//! The RMSE covers the beams that meet a line, so it has to be read with the share of the beams. The hub's lines need
+//! not be connected. On logs, points more than 1 m apart are not connected, and if there are too many lines, the
+//! worst are left out.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::Range;

@@ -1,6 +1,11 @@
 //! How exact is a robot's motion that is estimated from its scans, and how long does it take? The hub's method next to
 //! plain point-to-point and point-to-line matching of two scans, which start at the pose of the first scan and leave
 //! out the worst tenth of the pairs. Measured on recorded drives of real robots and on simulated ones.
+//!
+//! The positions of three logs come from a map that was built from them, with errors of about 20 mm; those of the model
+//! cars mean nothing below 5 mm. Steps of three of the logs are a meter and more, so the limits of `[motion]` are
+//! wider there. A step is wrong if it is off by 200 mm (100 mm for the cars) or 5 degrees. `people in half; hidden`
+//! compares with the same scans in which beams on people have no reading.
 
 use std::f64::consts::{PI, TAU};
 use std::time::Instant;

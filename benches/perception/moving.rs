@@ -4,6 +4,9 @@
 //!
 //! A beam counts as foreground if it meets a person with all of its spot, in space that was seen free at least five
 //! times. Not counted are beams at a person's edge, people where nothing was seen before, and the first 12 s.
+//!
+//! A point belongs to the other car within 0.2 m of its pose while it moves. A false beam is one reported more than
+//! 0.4 m from it.
 
 use std::ops::Range;
 use std::time::Instant;
