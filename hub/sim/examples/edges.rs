@@ -1,4 +1,4 @@
-//! Values between two surfaces at edges, in simulated scans. The table of docs/worlds.md has the same figures of recordings:
+//! Values between two surfaces at edges, in simulated scans. The table of docs/measured.md has the same figures of recordings:
 //! `cargo run --release -p scanhub-sim --example edges -- WORLD..`
 //! World `board` is a board in front of a wall.
 //!
