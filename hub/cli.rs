@@ -19,6 +19,7 @@ use scanhub_schema::{Failure, Family};
 use scanhub_shm::DEFAULT_DOMAIN;
 use scanhub_tools::{configure, probe, telegram};
 use scanhub_verbs::context::Context;
+use scanhub_verbs::with_new_name;
 use scanhub_verbs::{background, control, echo, hz, info, latency, leds, list, record, zones};
 use scanhub_viewer as viewer;
 
@@ -39,7 +40,7 @@ impl Cli {
     /// Parses the command line of this process.
     pub(crate) fn of_process() -> Result<Cli, clap::Error> {
         let mut command = Cli::command();
-        let matches = command.try_get_matches_from_mut(std::env::args_os())?;
+        let matches = command.try_get_matches_from_mut(std::env::args_os()).map_err(with_new_name)?;
         refuse_hub(&mut command, &matches)?;
         refuse_json(&mut command, &matches)?;
         Cli::from_arg_matches(&matches).map_err(|error| error.format(&mut command))

@@ -54,7 +54,7 @@ impl Bytes {
             .publish_subscribe::<[u8]>()
             .user_header::<Header>()
             .max_publishers(limits::PUBLISHERS)
-            .max_subscribers(TopicLimits::default().consumers)
+            .max_subscribers(TopicLimits::default().subscribers)
             .max_nodes(limits::NODES)
             .subscriber_max_buffer_size(limits::buffer(Topic::Scan))
             .subscriber_max_borrowed_samples(limits::BORROWED)
@@ -64,7 +64,9 @@ impl Bytes {
         let publisher = service
             .publisher_builder()
             .max_loaned_samples(limits::LOANED)
-            .override_sample_preallocation(|_| limits::samples(Topic::Scan, TopicLimits::default().consumers))
+            .override_sample_preallocation(|_| {
+                limits::samples(Topic::Scan, TopicLimits::default().subscribers)
+            })
             .initial_max_slice_len(task.payload)
             .create()?;
         Ok(Bytes { written: None, publisher, _service: service, contents: contents(task.payload), hub })

@@ -28,11 +28,11 @@ const TIME_US: [f64; 2] = [100.0, 1000.0];
 const NAMES: [[&str; 5]; 2] = [
     ["10 vertices: RMSE", "20 vertices: RMSE", "30 vertices: RMSE", "40 vertices: RMSE", "50 vertices: RMSE"],
     [
-        "10 vertices, polished: RMSE",
-        "20 vertices, polished: RMSE",
-        "30 vertices, polished: RMSE",
-        "40 vertices, polished: RMSE",
-        "50 vertices, polished: RMSE",
+        "10 vertices, refined: RMSE",
+        "20 vertices, refined: RMSE",
+        "30 vertices, refined: RMSE",
+        "40 vertices, refined: RMSE",
+        "50 vertices, refined: RMSE",
     ],
 ];
 
@@ -50,9 +50,9 @@ pub(crate) fn measure(is_quick: bool, is_json: bool) {
 
 /// Returns the hub's line finder, limited only by the number of vertices. Points farther apart than `gap_m` are not
 /// connected.
-fn hub(count: usize, polish: bool, gap_m: f64) -> LineFinder {
+fn hub(count: usize, refine: bool, gap_m: f64) -> LineFinder {
     // Two beams, as for the others: all beams of a room count.
-    let settings = Settings { max: count as u8 - 1, min_points: 2, polish, stop: Stop::Number(gap_m) };
+    let settings = Settings { max: count as u8 - 1, min_points: 2, refine, stop: Stop::Number(gap_m) };
     LineFinder::new(Pose::default(), settings, 1081)
 }
 
@@ -72,12 +72,12 @@ fn run(finder: &mut LineFinder, scans: &[Box<Scan>]) -> (Score, f64) {
 
 fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>) {
     let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| scans(draw_rooms(seed, RAYS))).collect();
-    for (form, polish) in [false, true].into_iter().enumerate() {
+    for (form, refine) in [false, true].into_iter().enumerate() {
         let mut times = Vec::new();
         for (number, &count) in VERTICES.iter().enumerate() {
             let (mut ours, mut theirs, mut shares) = (Vec::new(), Vec::new(), Vec::new());
             for scans in &draws {
-                let (score, time_us) = run(&mut hub(count, polish, f64::INFINITY), scans);
+                let (score, time_us) = run(&mut hub(count, refine, f64::INFINITY), scans);
                 ours.push(score.rmse);
                 shares.push(score.share);
                 times.push(time_us);
@@ -89,15 +89,15 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
             figures.push(Figure { name, unit: "m", hub: ours, baseline: theirs, target });
             cells.push(Cell {
                 table: "rooms: share of the beams".to_owned(),
-                row: if polish { "polished".to_owned() } else { "plain".to_owned() },
+                row: if refine { "refined".to_owned() } else { "plain".to_owned() },
                 column: count.to_string(),
                 unit: "1",
                 values: shares,
             });
         }
         let longer = scans(draw_rooms(1, 1081));
-        let of_longer = VERTICES.map(|count| run(&mut hub(count, polish, f64::INFINITY), &longer).1);
-        let name = if polish { "time of 1081 beams, polished" } else { "time of 1081 beams" };
+        let of_longer = VERTICES.map(|count| run(&mut hub(count, refine, f64::INFINITY), &longer).1);
+        let name = if refine { "time of 1081 beams, refined" } else { "time of 1081 beams" };
         figures.push(Figure {
             name,
             unit: "us",
@@ -105,7 +105,7 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
             baseline: Vec::new(),
             target: Target::None,
         });
-        let name = if polish { "time, polished" } else { "time" };
+        let name = if refine { "time, refined" } else { "time" };
         figures.push(Figure {
             name,
             unit: "us",
@@ -146,8 +146,8 @@ fn of_true_rooms(seeds: Range<u64>, cells: &mut Vec<Cell>) {
             });
         }
     };
-    for (row, polish) in [("default", false), ("polished", true)] {
-        let settings = Settings { polish, ..Settings::default() };
+    for (row, refine) in [("default", false), ("refined", true)] {
+        let settings = Settings { refine, ..Settings::default() };
         let mut finder = LineFinder::new(Pose::default(), settings, RAYS);
         put(row, &mut |room| {
             finder.update(&room.scan, &mut lines);
@@ -190,7 +190,7 @@ fn of_logs(most: usize, cells: &mut Vec<Cell>) {
                 put(row, mean(&scores));
             }
             put("hub", run(&mut hub(count, false, 1.0), &scans).0);
-            put("hub, polished", run(&mut hub(count, true, 1.0), &scans).0);
+            put("hub, refined", run(&mut hub(count, true, 1.0), &scans).0);
         }
     }
 }

@@ -27,7 +27,7 @@ impl Source {
         let lock = HubLock::acquire(domain.root())?;
         let node = scanhub_shm::hub_node(domain)?;
         // Maximum number of subscribers in any bench.
-        let limits = TopicLimits { consumers: 200, ..TopicLimits::default() };
+        let limits = TopicLimits { subscribers: 200, ..TopicLimits::default() };
         let waker = Waker::new(&node, SENSOR)?;
         let service = Scan::create(&node, SENSOR, &limits)?;
         let status = Status::create(&node, SENSOR, &limits)?;

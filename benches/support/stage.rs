@@ -113,7 +113,7 @@ impl Stage {
     /// Starts the hub with room for [`CROWD`] subscribers.
     pub(crate) fn hub_for_crowd(&self, sensors: &[&str]) -> Outcome<Child> {
         let mut command = self.hub_command(PROGRAM, sensors);
-        command.arg(format!("--set=limits.consumers={CROWD}"));
+        command.arg(format!("--set=limits.subscribers={CROWD}"));
         Child::of(command, Stdio::null())
     }
 

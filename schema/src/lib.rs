@@ -14,6 +14,7 @@ mod header;
 mod landmarks;
 mod motion;
 mod payload;
+mod renamed;
 mod scan;
 mod status;
 mod text;
@@ -43,6 +44,7 @@ pub mod payloads {
 pub use control::{Request, Response, Shown, Verb};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use payloads::*;
+pub use renamed::renamed;
 pub use text::{Failure, Kind, Printable, escape_json, json_line};
 pub use time::{Age, MICROS, MILLIS, MIN_RATE_SPAN, Nanos, line_time, rate_hz};
 pub use topic::{

@@ -1,5 +1,5 @@
-//! How much every service holds. Explicit, because the defaults of the shared-memory library (8 consumers, 20 nodes,
-//! 2 samples) are too small, and because a consumer that asks for more than was created is refused.
+//! How much every service holds. Explicit, because the defaults of the shared-memory library (8 subscribers, 20 nodes,
+//! 2 samples) are too small, and because a subscriber that asks for more than was created is refused.
 
 use std::ops::RangeInclusive;
 
@@ -10,10 +10,10 @@ pub const PUBLISHERS: usize = 1;
 /// What is said of the topics of a sensor when they are made. All else is the same for all sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TopicLimits {
-    /// Consumers of each topic at a time, one of [`TopicLimits::CONSUMERS`]. For each sample the shared-memory library looks at
+    /// Subscribers of each topic at a time, one of [`TopicLimits::SUBSCRIBERS`]. For each sample the shared-memory library looks at
     /// all places three times, and they are far apart in memory; each has memory for the samples that it may hold. So if few
     /// programs follow, many places cost more than the sample.
-    pub consumers: usize,
+    pub subscribers: usize,
     /// The most beams of a scan.
     pub beams: usize,
     /// The arrays that its scans may have, bits of [`Contents`].
@@ -23,8 +23,8 @@ pub struct TopicLimits {
 }
 
 impl TopicLimits {
-    /// How many consumers a topic can be made for. The event that wakes them has no more places.
-    pub const CONSUMERS: RangeInclusive<usize> = 1..=LISTENERS;
+    /// How many subscribers a topic can be made for. The event that wakes them has no more places.
+    pub const SUBSCRIBERS: RangeInclusive<usize> = 1..=LISTENERS;
 
     /// Refuses what cannot be.
     ///
@@ -32,12 +32,12 @@ impl TopicLimits {
     ///
     /// [`Kind::Configuration`] with the value and what can be.
     pub fn check(&self) -> Result<(), Failure> {
-        let (TopicLimits { consumers, .. }, all) = (self, Self::CONSUMERS);
-        if all.contains(consumers) {
+        let (TopicLimits { subscribers, .. }, all) = (self, Self::SUBSCRIBERS);
+        if all.contains(subscribers) {
             return Ok(());
         }
         let hint = format!("{} to {}", all.start(), all.end());
-        Err(Failure::new(Kind::Configuration, format!("topics for {consumers} consumers"), hint))
+        Err(Failure::new(Kind::Configuration, format!("topics for {subscribers} subscribers"), hint))
     }
 }
 
@@ -45,7 +45,7 @@ impl Default for TopicLimits {
     /// For an LMS: 100 degrees in quarters.
     fn default() -> Self {
         TopicLimits {
-            consumers: 32,
+            subscribers: 32,
             beams: 401,
             contents: Contents::UPPER,
             telegram: Family::Lms.max_telegram(),
@@ -55,11 +55,11 @@ impl Default for TopicLimits {
 
 /// Processes that have a service open.
 pub const NODES: usize = 260;
-/// Samples that a consumer may hold at a time.
+/// Samples that a subscriber may hold at a time.
 pub const BORROWED: usize = 4;
 /// Samples that the publisher may have in work at a time.
 pub const LOANED: usize = 2;
-/// Consumers that sleep on a wake service: those of all topics of a sensor.
+/// Subscribers that sleep on a wake service: those of all topics of a sensor.
 pub const LISTENERS: usize = 250;
 /// Notifiers of a wake service: the hub's link, and those of dead hubs that are not cleaned up yet.
 pub const NOTIFIERS: usize = 4;
@@ -71,18 +71,18 @@ pub const CONTROL_CLIENTS: usize = 16;
 /// Processes that have the control service open, dead ones that are not cleaned up yet among them.
 pub const CONTROL_NODES: usize = 32;
 
-/// Returns the number of samples that wait for a consumer of `topic`.
+/// Returns the number of samples that wait for a subscriber of `topic`.
 pub const fn buffer(topic: Topic) -> usize {
     topic.row().waiting
 }
 
-/// Returns the number of samples that a consumer of `topic` gets which comes later.
+/// Returns the number of samples that a subscriber of `topic` gets which comes later.
 pub const fn history(topic: Topic) -> usize {
     topic.row().kept
 }
 
-/// Returns the number of samples to reserve memory for where `consumers` have places. All queues hold the same latest
+/// Returns the number of samples to reserve memory for where `subscribers` have places. All queues hold the same latest
 /// samples, so that their number does not count.
-pub const fn samples(topic: Topic, consumers: usize) -> usize {
-    buffer(topic) + consumers * BORROWED + history(topic) + LOANED
+pub const fn samples(topic: Topic, subscribers: usize) -> usize {
+    buffer(topic) + subscribers * BORROWED + history(topic) + LOANED
 }

@@ -15,7 +15,7 @@ pub(super) fn processors(data: &[u8]) {
     let most = TopicLimits::default().beams;
     let pose = bytes.pose();
     let radii_mm: Vec<u16> = (0..bytes.u8() % 10).map(|_| bytes.u16()).collect();
-    let self_min: Vec<zones::Sector> = (0..bytes.u8() % 80)
+    let body_mask: Vec<zones::Sector> = (0..bytes.u8() % 80)
         .map(|_| zones::Sector { from_mdeg: bytes.i32(), to_mdeg: bytes.i32(), range_mm: bytes.u16() })
         .collect();
     let flags = bytes.u8();
@@ -24,7 +24,7 @@ pub(super) fn processors(data: &[u8]) {
         pose,
         &zones::Settings {
             radii_mm: radii_mm.clone(),
-            self_min,
+            body_mask,
             margin_mm: bytes.u16(),
             min_beams: bytes.u16(),
             min_scans: u16::from(bytes.u8()),
@@ -36,7 +36,7 @@ pub(super) fn processors(data: &[u8]) {
     );
     let max_gap = u16::from(bytes.u8());
     let mut finder = marks::MarkDetector::new(marks::Settings {
-        i_min: bytes.u8(),
+        min_level: bytes.u8(),
         level: is(2).then(|| bytes.u16()),
         max_range_step_mm: bytes.u16(),
         max_gap,

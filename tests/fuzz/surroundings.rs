@@ -18,7 +18,7 @@ pub(super) fn surroundings(data: &[u8]) {
     let of_lines = lines::Settings {
         max: 1 + bytes.u8() % 64,
         min_points: 3 + u16::from(bytes.u8() % 16),
-        polish: bytes.u8() % 4 == 0,
+        refine: bytes.u8() % 4 == 0,
         stop: Stop::Likelihood,
     };
     let of_motion = motion::Settings {

@@ -57,7 +57,7 @@ fn follow(place: &Domain, count: usize, wanted: usize) -> u64 {
 fn forty_consumers_lose_nothing() {
     in_own_process("limits_consumers::forty_consumers_lose_nothing", || {
         let env = TestEnv::new();
-        let hub = streaming(&env, 100, &["--set=limits.consumers=41"]);
+        let hub = streaming(&env, 100, &["--set=limits.subscribers=41"]);
         let mut echo = env.echo(&["front/scan"]);
         let place = env.place();
         let threads: Vec<_> = (0..4)
@@ -82,7 +82,7 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
         "limits_consumers::more_consumers_than_there_are_places_are_refused_with_the_limit",
         || {
             let env = TestEnv::new();
-            let hub = env.hub(&[env.link("front"), "--set=limits.consumers=3".to_owned()]);
+            let hub = env.hub(&[env.link("front"), "--set=limits.subscribers=3".to_owned()]);
             let node = scanhub_shm::client_node(&env.place()).expect("joins");
             let topic = Scan::open(&node, "front").expect("works").expect("is there");
             let subscribers: Vec<_> =
@@ -91,8 +91,11 @@ fn more_consumers_than_there_are_places_are_refused_with_the_limit() {
             let outcome = env.run(&["echo", "front/scan", "--json"]);
             let error = &outcome.of_class("error")[0];
             assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-            assert_eq!(error["message"], "scanhub/v2/front/scan has 3 consumers, the most that are possible");
-            assert!(error["hint"].to_string().contains("limits.consumers, up to 250"), "{error}");
+            assert_eq!(
+                error["message"],
+                "scanhub/v2/front/scan has 3 subscribers, the most that are possible"
+            );
+            assert!(error["hint"].to_string().contains("limits.subscribers, up to 250"), "{error}");
             // The other topics are not concerned.
             assert_eq!(env.info("front")["state"], "absent");
             drop(subscribers);
@@ -108,7 +111,7 @@ fn a_consumer_without_a_place_is_told_the_flag() {
     in_a_network("limits_consumers::a_consumer_without_a_place_is_told_the_flag", || {
         let env = TestEnv::new();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
-        let flags = ["listen", "--json", "--publish", "--consumers=2", "--name=robot1=5f3a12bc00d1e2f3"];
+        let flags = ["listen", "--json", "--publish", "--subscribers=2", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut program = env.start(&flags).ready();
         sender.await_published(&mut program, &[Topic::Zones, Topic::Status]);
         let node = scanhub_shm::client_node(&env.place()).expect("joins");
@@ -117,8 +120,8 @@ fn a_consumer_without_a_place_is_told_the_flag() {
         let outcome = env.run(&["echo", "robot1.front/zones", "--json"]);
         let error = &outcome.of_class("error")[0];
         assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
-        assert!(error["message"].as_str().is_some_and(|text| text.contains("has 2 consumers")), "{error}");
-        assert!(error["hint"].as_str().is_some_and(|text| text.contains("greater --consumers")), "{error}");
+        assert!(error["message"].as_str().is_some_and(|text| text.contains("has 2 subscribers")), "{error}");
+        assert!(error["hint"].as_str().is_some_and(|text| text.contains("greater --subscribers")), "{error}");
         drop((subscribers, topic, node));
         assert_eq!(program.end(TERM).code, Some(0));
     });

@@ -191,7 +191,7 @@ fn more_links_than_a_hub_can_have_are_refused_at_the_first_of_them() {
     refused(&env, &["config", "check", &far_more], 66, "it is longer than 524288 bytes");
     // Values of which each has a place of its own.
     let sectors = "{from_deg=1.0,to_deg=2.0,range=0.1},".repeat(13_000);
-    let sectors = format!("{}[zones]\nself_min = [{sectors}]\n", links(2));
+    let sectors = format!("{}[zones]\nbody_mask = [{sectors}]\n", links(2));
     let outcome = bounded(&env, &["config", "check", &env.file("sectors.toml", sectors)]);
     assert!(matches!(outcome.code, Some(0 | 78)), "{outcome}");
 }

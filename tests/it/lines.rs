@@ -12,7 +12,7 @@ fn list<'a>(line: &'a Value, key: &str) -> &'a [Value] {
 #[test]
 fn lines_come_while_they_are_followed_and_as_the_link_says() {
     let env = TestEnv::new();
-    let set = ["--set=lines.polish=true", "--set=link.rear.lines.max=2"].map(str::to_owned);
+    let set = ["--set=lines.refine=true", "--set=link.rear.lines.max=2"].map(str::to_owned);
     let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
     let simulator = env.simulator(&["front", "rear"], &STREAM);
     env.await_info("front", |info| info["state"] == "streaming");

@@ -51,7 +51,7 @@ fn a_robot_that_knows_its_own_post_goes_on() {
 
     let text = String::from_utf8(outcome.out.clone()).unwrap();
     let table: toml::Table = text.parse().unwrap_or_else(|error| panic!("{error}: {outcome}"));
-    let sectors = table["link"][0]["zones"]["self_min"].as_array().unwrap();
+    let sectors = table["link"][0]["zones"]["body_mask"].as_array().unwrap();
     let key = |sector: &toml::Value, key: &str| sector[key].as_float().unwrap();
     // The post is 6 degrees wide, and a beam or two beside it meet its edge.
     let first = sectors.iter().map(|sector| key(sector, "from_deg")).fold(90.0, f64::min);
@@ -76,7 +76,7 @@ fn a_robot_that_knows_its_own_post_goes_on() {
         (&mask["sensor"], &mask["within_m"], &mask["of_beams"]),
         (&"front".into(), &1.0.into(), &361.into())
     );
-    assert_eq!(mask["self_min"].as_array().map(|sectors| sectors.is_empty()), Some(false), "{mask}");
+    assert_eq!(mask["body_mask"].as_array().map(|sectors| sectors.is_empty()), Some(false), "{mask}");
     assert_eq!(mask["moving"], serde_json::json!([]), "{mask}");
 }
 
@@ -90,7 +90,7 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let doubt = "nothing of the robot is seen within 1.0 m of its centre: no mask is needed";
     assert!(outcome.errors.contains(doubt), "{outcome}");
-    assert!(outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
+    assert!(outcome.out.ends_with(b"body_mask = []\n"), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
     let file = env.file("mask.toml", &outcome.out);
     let _hub = env.hub(&[&env.link("front"), "--config", &file]);
@@ -115,7 +115,7 @@ fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask()
     let outcome = mask(&env, &["--within", "1.5"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
-    assert!(!outcome.out.ends_with(b"self_min = []\n"), "{outcome}");
+    assert!(!outcome.out.ends_with(b"body_mask = []\n"), "{outcome}");
 }
 
 #[test]

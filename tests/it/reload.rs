@@ -45,7 +45,7 @@ fn circles_change_in_a_stream_without_a_gap() {
     zones.await_lines(10, "a verdict", has_radii(&[1000, 600]));
     for (more, wanted) in [
         ("pose = { x = 0.3 }\n[zones]\nradii = [2.0, 1.0, 0.5]\n", &[2000, 1000, 500][..]),
-        ("[zones]\nradii = [0.7]\n[marks]\ni_min = 3\n[background]\nmethod = \"paper\"\n", &[700]),
+        ("[zones]\nradii = [0.7]\n[marks]\nmin_level = 3\n[background]\nmethod = \"paper\"\n", &[700]),
         ("[background]\nmethod = \"off\"\n", &[1000, 600]),
         ("[zones]\nradii = [3.0]\n", &[3000]),
     ] {

@@ -47,9 +47,9 @@ struct Cli {
     /// Hub to publish, by its 16 hex digits or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB", requires = "publish")]
     hubs: Vec<String>,
-    /// Places for consumers of each published topic, 1 to 250
+    /// Places for subscribers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
-    consumers: u16,
+    subscribers: u16,
     /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
@@ -105,7 +105,7 @@ impl Cli {
         });
         let publish = self.publish.then(|| {
             let domain = publisher_domain(&self.domain, self.root.as_deref(), &environment)?;
-            let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
+            let limits = TopicLimits { subscribers: self.subscribers.into(), ..TopicLimits::default() };
             let topics = received_topics(&self.topics)?;
             let memory = u64::from(self.memory) << 20;
             Ok::<_, Failure>(PublishOptions {
@@ -193,7 +193,7 @@ fn distro(name: &str) -> Result<Distro, String> {
 }
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = Cli::try_parse().unwrap_or_else(|error| scanhub_verbs::with_new_name(error).exit());
     let json = cli.json;
     match run(cli) {
         Ok(()) => ExitCode::SUCCESS,

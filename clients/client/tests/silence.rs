@@ -209,7 +209,7 @@ fn a_topic_without_a_place_is_full() {
     let lock = scanhub_shm::HubLock::acquire(place.domain.root()).unwrap();
     let node = scanhub_shm::hub_node(&place.domain).unwrap();
     let _waker = scanhub_shm::Waker::new(&node, "front").unwrap();
-    let limits = TopicLimits { consumers: 1, ..TopicLimits::default() };
+    let limits = TopicLimits { subscribers: 1, ..TopicLimits::default() };
     let scan = Scan::create(&node, "front", &limits).unwrap();
     let _publisher = Scan::publisher(&scan, &limits).unwrap();
     lock.report_ready().unwrap();
@@ -220,7 +220,7 @@ fn a_topic_without_a_place_is_full() {
     assert!(second.try_next().is_err());
     let silence = second.why_silent();
     assert!(matches!(silence, Silence::Full { .. }), "{silence}");
-    assert!(silence.remedy().contains("limits.consumers"), "{}", silence.remedy());
+    assert!(silence.remedy().contains("limits.subscribers"), "{}", silence.remedy());
     drop(first);
     until("the place", || {
         second.try_next().is_ok_and(|scan| scan.is_none()) && second.why_silent() == Silence::Waiting

@@ -59,9 +59,9 @@ pub struct ListenArgs {
     /// can use them like sensors of a hub
     #[arg(long)]
     publish: bool,
-    /// Places for consumers of each published topic, 1 to 250
+    /// Places for subscribers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
-    consumers: u16,
+    subscribers: u16,
     /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is
     /// refused
     #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
@@ -110,7 +110,7 @@ impl ListenArgs {
             key,
             state: StateDirectory::of_domain(&context.domain.name),
             publish: publish.as_ref(),
-            limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },
+            limits: TopicLimits { subscribers: self.subscribers.into(), ..TopicLimits::default() },
             memory: u64::from(self.memory) << 20,
             only_proven: self.key_file.is_none(),
             stats: self.stats,

@@ -20,9 +20,11 @@ pub mod output;
 mod receive_stats;
 #[cfg(feature = "record")]
 pub mod record;
+mod renamed_flag;
 pub mod show;
 pub mod text;
 pub mod zones;
 
 pub use follow::Bounds;
 pub use json::error as error_line;
+pub use renamed_flag::with_new_name;

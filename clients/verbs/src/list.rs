@@ -79,7 +79,7 @@ fn topics(json: bool, places: &[Domain], out: &mut dyn Write, stop: &AtomicBool)
     if json {
         return quiet(lines.iter().try_for_each(|line| output.json(line)));
     }
-    let mut rows = vec![["TOPIC", "HZ", "CONSUMERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
+    let mut rows = vec![["TOPIC", "HZ", "SUBSCRIBERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
     rows.extend(lines.iter().map(Line::row));
     quiet(
         table(&mut output, &rows).and_then(|()| {

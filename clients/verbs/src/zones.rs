@@ -287,9 +287,9 @@ impl Found<'_> {
         text += "# As its own file in /etc/scanhub/conf.d, or without the first lines among the link's other keys.\n";
         let _ = writeln!(text, "[[link]]\nname = \"{sensor}\"\n\n[link.zones]");
         if mask.sectors.is_empty() {
-            return text + "self_min = []\n";
+            return text + "body_mask = []\n";
         }
-        text += "self_min = [\n";
+        text += "body_mask = [\n";
         for Sector { from_mdeg, to_mdeg, range_mm, .. } in &mask.sectors {
             let (from, to, range) = (degrees(*from_mdeg), degrees(*to_mdeg), metres(*range_mm));
             let _ = writeln!(text, "    {{ from_deg = {from}, to_deg = {to}, range = {range} }},");
@@ -308,7 +308,7 @@ impl Found<'_> {
             within_m: f64,
             beams: usize,
             of_beams: usize,
-            self_min: Vec<Part>,
+            body_mask: Vec<Part>,
             moving: Vec<Part>,
         }
         /// As in the configuration: degrees and metres.
@@ -331,7 +331,7 @@ impl Found<'_> {
             within_m: self.within_mm / 1000.0,
             beams: self.beams(),
             of_beams: self.mask.of_beams,
-            self_min: self.mask.sectors.iter().map(part).collect(),
+            body_mask: self.mask.sectors.iter().map(part).collect(),
             moving: self.mask.moving.iter().map(part).collect(),
         }
     }

@@ -12,11 +12,11 @@ use crate::section::{Section, optional, section, whole_or};
 
 section! {
     /// Keys of section `limits`.
-    pub(crate) struct LimitsKeys: "keys of limits, as { consumers = 32 }" {
+    pub(crate) struct LimitsKeys: "keys of limits, as { subscribers = 32 }" {
         /// subscribers of each topic, 1 to 250
-        consumers: i64 = TopicLimits::default().consumers as i64, check whole_or(
-            *TopicLimits::CONSUMERS.start() as i64..=*TopicLimits::CONSUMERS.end() as i64,
-            format!("{} to {}", TopicLimits::CONSUMERS.start(), TopicLimits::CONSUMERS.end()),
+        subscribers: i64 = TopicLimits::default().subscribers as i64, check whole_or(
+            *TopicLimits::SUBSCRIBERS.start() as i64..=*TopicLimits::SUBSCRIBERS.end() as i64,
+            format!("{} to {}", TopicLimits::SUBSCRIBERS.start(), TopicLimits::SUBSCRIBERS.end()),
         );
     }
 }

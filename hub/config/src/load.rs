@@ -199,7 +199,7 @@ impl<'a> Merged<'a> {
         let links = self.links.iter().map(|link| link.finish(self.sources)).collect::<Result<Vec<_>, _>>()?;
         check_ports(&links)?;
         let limits: LimitsKeys = self.section("limits")?;
-        let limits = TopicLimits { consumers: limits.consumers as usize, ..TopicLimits::default() };
+        let limits = TopicLimits { subscribers: limits.subscribers as usize, ..TopicLimits::default() };
         Ok(Config { links, limits })
     }
 

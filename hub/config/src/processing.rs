@@ -136,7 +136,7 @@ section! {
         /// `to_deg` (degrees within -180 to 180: 0 ahead, 90 left, -90 right; `from_deg` is the smaller one), readings
         /// nearer than `range` meters are ignored. `from` and `to`, which counted from the right, are refused, and the
         /// message has the sector in the new keys. `scanhub zones SENSOR mask` learns these sectors.
-        self_min: Vec<SectorKeys> = Vec::new(), check sectors;
+        body_mask: Vec<SectorKeys> = Vec::new(), check sectors;
         /// meters added to each radius
         ///
         /// Meters added to every circle, up to 10.
@@ -182,11 +182,11 @@ pub(crate) struct SectorKeys {
 
 section! {
     /// Keys of section `marks`.
-    pub(crate) struct MarksKeys: "keys of marks, as { i_min = 1 } or { level = 240 }" {
+    pub(crate) struct MarksKeys: "keys of marks, as { min_level = 1 } or { level = 240 }" {
         /// reflectors of an LMS: lowest level, 1 to 7
         ///
         /// For an LMS: lowest level of a beam of a mark, 1 to 7.
-        i_min: i64 = 1, check whole(1..=7);
+        min_level: i64 = 1, check whole(1..=7);
         /// reflectors of all other scanners: lowest intensity, 1 to 65535; no default
         ///
         /// For all other scanners: lowest intensity of a beam of a mark, 1 to 65535.
@@ -204,7 +204,7 @@ section! {
 
 section! {
     /// Keys of section `lines`.
-    pub(crate) struct LinesKeys: "keys of lines, as { max = 20, polish = true }" {
+    pub(crate) struct LinesKeys: "keys of lines, as { max = 20, refine = true }" {
         /// lines of a scan, 1 to 64
         ///
         /// Maximum number of lines of a scan, 1 to 64. If there are more, those that differ least are joined, and beams
@@ -218,7 +218,7 @@ section! {
         ///
         /// Whether cuts between lines are moved to wherever they help most, and beams that fit worst at the ends of lines
         /// are left out, at most one in twenty. This is slower.
-        polish: bool = false;
+        refine: bool = false;
     }
 }
 
@@ -338,7 +338,7 @@ impl Processing {
             },
             zones: zones::Settings {
                 radii_mm: zones.radii.iter().copied().map(in_mm).collect(),
-                self_min: zones.self_min.iter().filter_map(SectorKeys::sector).collect(),
+                body_mask: zones.body_mask.iter().filter_map(SectorKeys::sector).collect(),
                 margin_mm: in_mm(zones.margin),
                 min_beams: zones.min_beams as u16,
                 min_scans: zones.min_scans as u16,
@@ -347,7 +347,7 @@ impl Processing {
                 no_return_is_far: zones.no_return_is_far,
             },
             marks: marks::Settings {
-                i_min: marks.i_min as u8,
+                min_level: marks.min_level as u8,
                 level: marks.level.map(|level| level as u16),
                 max_range_step_mm: in_mm(marks.max_range_step),
                 max_gap: marks.max_gap as u16,
@@ -355,7 +355,7 @@ impl Processing {
             lines: lines::Settings {
                 max: lines.max as u8,
                 min_points: lines.min_points as u16,
-                polish: lines.polish,
+                refine: lines.refine,
                 ..lines::Settings::default()
             },
             motion: motion::Settings {
@@ -434,10 +434,10 @@ pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Famil
         let (what, remedy) = match key {
             "marks.level" => (
                 format!("level, and the intensities of an {name} are levels of reflectors, 0 to 7"),
-                "i_min is the least of them",
+                "min_level is the least of them",
             ),
-            "marks.i_min" => (
-                format!("i_min, and the intensities of an {name} are counts of any surface"),
+            "marks.min_level" => (
+                format!("min_level, and the intensities of an {name} are counts of any surface"),
                 "level is the least of a reflector, as intensities of scans show it",
             ),
             _ => (
@@ -453,7 +453,7 @@ pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Famil
 /// Returns whether a scanner of `family` has the key of a section. If the scanner is searched for, it may have all.
 pub(crate) fn has_key(family: Option<Family>, key: &str) -> bool {
     family.is_none_or(|family| match key {
-        "marks.i_min" => family.has_reflector_levels(),
+        "marks.min_level" => family.has_reflector_levels(),
         "marks.level" => !family.has_reflector_levels(),
         "early.pieces" => features(family).has_whole_telegrams,
         _ => true,
@@ -461,7 +461,7 @@ pub(crate) fn has_key(family: Option<Family>, key: &str) -> bool {
 }
 
 /// Keys that only some families have.
-const FAMILY_KEYS: [&str; 3] = ["early.pieces", "marks.level", "marks.i_min"];
+const FAMILY_KEYS: [&str; 3] = ["early.pieces", "marks.level", "marks.min_level"];
 
 /// Returns the nearest whole number of millimeters, saturated to a u16.
 fn in_mm(meters: f64) -> u16 {
@@ -583,7 +583,7 @@ pub(crate) fn check_coverage(
         return Ok(());
     }
     let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
-    if detecting(&zones::Settings { self_min: Vec::new(), ..settings.clone() }) == 0 {
+    if detecting(&zones::Settings { body_mask: Vec::new(), ..settings.clone() }) == 0 {
         return refuse(
             &["pose.x", "pose.y", "pose.yaw"],
             format!("no beam sees into the circle of {circle_m} m"),
@@ -592,14 +592,14 @@ pub(crate) fn check_coverage(
     }
     if seeing == 0 {
         return refuse(
-            &["zones.self_min"],
-            format!("self_min covers every beam up to the circle of {circle_m} m"),
-            "shorten self_min: it is only for the robot's own body",
+            &["zones.body_mask"],
+            format!("body_mask covers every beam up to the circle of {circle_m} m"),
+            "shorten body_mask: it is only for the robot's own body",
         );
     }
     refuse(
         &["zones.min_beams"],
         format!("min_beams = {min_beams}, and {seeing} can see the circle of {circle_m} m"),
-        "set fewer beams, a larger circle, or another pose or self_min",
+        "set fewer beams, a larger circle, or another pose or body_mask",
     )
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use scanhub_files::regular;
-use scanhub_schema::{Failure, Kind};
+use scanhub_schema::{Failure, Kind, renamed};
 use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeArray, DeTable, DeValue, ValueDeserializer};
@@ -172,6 +172,10 @@ impl SourceMap {
             [("unknown field", "unknown key", "Known"), ("unknown variant", "not possible:", "Possible")];
         let said = unknown.into_iter().find(|(said, ..)| message.starts_with(said));
         if let (Some((_, what, those)), [unknown, known @ ..]) = (said, &names[..]) {
+            let is_here = |key: &&str| key.rsplit('.').next().is_some_and(|last| known.contains(&last));
+            if let Some(new) = renamed(unknown).filter(is_here) {
+                return self.refuse(span, format!("{what} `{unknown}`"), format!("its new name is `{new}`"));
+            }
             let nearest = known
                 .iter()
                 .max_by(|a, b| strsim::jaro_winkler(a, unknown).total_cmp(&strsim::jaro_winkler(b, unknown)));

@@ -49,7 +49,7 @@ fn the_page_holds() {
     let config = load(&[&file], &[]).unwrap();
     let [front, rear, side, top] = &config.links[..] else { panic!("{config:?}") };
     assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
-    assert_eq!(front.processing.zones.self_min.len(), 1);
+    assert_eq!(front.processing.zones.body_mask.len(), 1);
     assert_eq!(front.processing.zones.margin_mm, 50);
     let set = &side.scanner.settings;
     assert_eq!((side.family(), set.model, set.beams), (Some(Family::Ld), Some("ld19"), Some(450)));
@@ -106,10 +106,10 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     );
     let second = Scratch::new(
         "second.toml",
-        "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
+        "[zones]\nmargin = 0.01\nradii = [2.0]\nbody_mask = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
          [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
-         publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n\
-         [lines]\nmax = 20\npolish = true\n[motion]\nmax_step = 0.8\n",
+         publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\nmin_level = 2\nmax_gap = 1\n\
+         [lines]\nmax = 20\nrefine = true\n[motion]\nmax_step = 0.8\n",
     );
     let set = ["link.a.pose.x=-0.25", "link.a.pose.upside_down=true", "zones.radii=[1.2,0.7]"];
     let set = [
@@ -126,7 +126,7 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     assert_eq!((a.pose.x_m, a.pose.y_m, a.pose.yaw_rad, a.pose.upside_down), (-0.25, 0.0, 1.5, 1));
     assert_eq!((a.zones.margin_mm, b.zones.margin_mm), (50, 10));
     assert_eq!((&a.zones.radii_mm, &b.zones.radii_mm), (&vec![1200, 700], &vec![1200, 700]));
-    assert_eq!(a.zones.self_min, [Sector { from_mdeg: -77_500, to_mdeg: -60_000, range_mm: 420 }]);
+    assert_eq!(a.zones.body_mask, [Sector { from_mdeg: -77_500, to_mdeg: -60_000, range_mm: 420 }]);
     assert_eq!((a.zones.exact, b.zones.exact), (true, false));
     let learning = a.background.learning;
     assert_eq!(
@@ -135,11 +135,11 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     );
     assert_eq!((learning.threshold_mm, learning.candidate_mm, learning.scans), (Some(40), None, Some(100)));
     assert_eq!((a.background.is_kept, b.background.is_kept, a.background.every_scan), (true, false, true));
-    assert_eq!((a.marks.max_range_step_mm, a.marks.i_min, a.marks.max_gap), (200, 2, 1));
-    assert_eq!((a.lines.max, a.lines.min_points, a.lines.polish), (20, 5, true));
+    assert_eq!((a.marks.max_range_step_mm, a.marks.min_level, a.marks.max_gap), (200, 2, 1));
+    assert_eq!((a.lines.max, a.lines.min_points, a.lines.refine), (20, 5, true));
     assert_eq!((a.motion.max_step_m, a.motion.max_turn_deg, a.motion.min_overlap), (0.8, 30.0, 0.4));
     assert_eq!((b.motion.max_step_m, b.motion.max_turn_deg), (0.8, 40.0));
-    assert_eq!((b.lines.max, b.lines.min_points, b.lines.polish), (20, 9, true));
+    assert_eq!((b.lines.max, b.lines.min_points, b.lines.refine), (20, 9, true));
 }
 
 #[test]
@@ -168,28 +168,28 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("zones.max_invalid=nan", "max_invalid = NaN"),
         ("zones.min_beams=0", "min_beams = 0\n  a whole number from 1 to 8192"),
         ("zones.min_scans=1.5", "min_scans = 1.5 is not a whole number\n  see docs"),
-        ("zones.self_min=[{from_deg=30,to_deg=12,range=0.4}]", "from before to"),
+        ("zones.body_mask=[{from_deg=30,to_deg=12,range=0.4}]", "from before to"),
         (
-            "zones.self_min=[{from_deg=-181,to_deg=12,range=0.4}]",
-            "self_min = { from_deg = -181, to_deg = 12, range = 0.4 }\n  from_deg and to_deg are",
+            "zones.body_mask=[{from_deg=-181,to_deg=12,range=0.4}]",
+            "body_mask = { from_deg = -181, to_deg = 12, range = 0.4 }\n  from_deg and to_deg are",
         ),
-        ("zones.self_min=[{from_deg=-1,to_deg=180.5,range=0.4}]", "0 ahead, 90 left, -90 right"),
+        ("zones.body_mask=[{from_deg=-1,to_deg=180.5,range=0.4}]", "0 ahead, 90 left, -90 right"),
         (
-            "zones.self_min=[{from=100.1,to=120,range=0.4}]",
-            "self_min = { from = 100.1, to = 120, range = 0.4 } counts angles from the right\n  angles are counted from \
+            "zones.body_mask=[{from=100.1,to=120,range=0.4}]",
+            "body_mask = { from = 100.1, to = 120, range = 0.4 } counts angles from the right\n  angles are counted from \
              ahead now: { from_deg = 10.1, to_deg = 30.0, range = 0.4 }",
         ),
-        ("zones.self_min=[{from=0,to=20,range=1}]", "{ from_deg = -90.0, to_deg = -70.0, range = 1.0 }"),
-        ("zones.self_min=[{from_deg=1,to=20,range=1}]", "without its two angles\n  give it both"),
-        ("zones.self_min=[{range=1}]", "without its two angles"),
-        ("zones.self_min=[{from_deg=1,to_deg=12,range=0}]", "range in metres"),
-        ("zones.self_min=[{from_deg=1,to_deg=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
+        ("zones.body_mask=[{from=0,to=20,range=1}]", "{ from_deg = -90.0, to_deg = -70.0, range = 1.0 }"),
+        ("zones.body_mask=[{from_deg=1,to=20,range=1}]", "without its two angles\n  give it both"),
+        ("zones.body_mask=[{range=1}]", "without its two angles"),
+        ("zones.body_mask=[{from_deg=1,to_deg=12,range=0}]", "range in metres"),
+        ("zones.body_mask=[{from_deg=1,to_deg=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
         ("zonse.margin=1", "unknown key `zonse`\n  did you mean `zones`?"),
-        ("marks.i_min=8", "i_min = 8\n  a whole number from 1 to 7"),
+        ("marks.min_level=8", "min_level = 8\n  a whole number from 1 to 7"),
         ("marks.level=0", "level = 0\n  a whole number from 1 to 65535"),
         (
             "link.front.marks.level=200",
-            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  i_min is",
+            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  min_level is",
         ),
         ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
         ("marks.max_gap=-1", "max_gap = -1"),
@@ -216,11 +216,15 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
     }
     let many = vec!["{ from_deg = 1, to_deg = 2, range = 1 }"; 65].join(",");
-    let refusal = load(&[], &[&format!("zones.self_min=[{many}]")]).unwrap_err();
-    assert!(refusal.contains("self_min has 65 sectors\n  at most 64"), "{refusal}");
-    let deep = Scratch::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\ni_mni = 1\n");
+    let refusal = load(&[], &[&format!("zones.body_mask=[{many}]")]).unwrap_err();
+    assert!(refusal.contains("body_mask has 65 sectors\n  at most 64"), "{refusal}");
+    let deep =
+        Scratch::new("deep.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.marks]\nmin_levle = 1\n");
     let refusal = load(&[&deep], &[]).unwrap_err();
-    assert!(refusal.contains("deep.toml:5:1: unknown key `i_mni`\n  did you mean `i_min`?"), "{refusal}");
+    assert!(
+        refusal.contains("deep.toml:5:1: unknown key `min_levle`\n  did you mean `min_level`?"),
+        "{refusal}"
+    );
     let nowhere = "[[link]]\nname = \"a\"\nport = \"x\"\n[background]\nstart = \"/nope.json\"\n";
     let nowhere = Scratch::new("nowhere.toml", nowhere);
     let refusal = load(&[&nowhere], &[]).unwrap_err();
@@ -270,11 +274,11 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
     let far = ["link.front.pose.x=40", "link.front.pose.yaw=3.1416"];
     assert_eq!(set(&far), Ok(()));
     refused(&[&far[..], &["link.front.unit=mm"]].concat(), "no beam sees into the circle of 1 m");
-    let body = |range: &str| format!("link.rear.zones.self_min=[{{from_deg=-90,to_deg=90,range={range}}}]");
+    let body = |range: &str| format!("link.rear.zones.body_mask=[{{from_deg=-90,to_deg=90,range={range}}}]");
     assert_eq!(set(&[&body("0.99")]), Ok(()));
     refused(
         &[&body("1.0")],
-        "link rear: self_min covers every beam up to the circle of 1 m\n  shorten self_min",
+        "link rear: body_mask covers every beam up to the circle of 1 m\n  shorten body_mask",
     );
     let file = Scratch::new(
         "away.toml",
@@ -319,25 +323,44 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
 }
 
 #[test]
-fn topics_have_places_for_as_many_consumers_as_are_configured() {
-    let places = |set: &[&str]| load(&[], set).map(|config| config.limits.consumers);
+fn topics_have_places_for_as_many_subscribers_as_are_configured() {
+    let places = |set: &[&str]| load(&[], set).map(|config| config.limits.subscribers);
     assert_eq!(places(&[]), Ok(32));
-    for (set, consumers) in [("limits.consumers=1", 1), ("limits.consumers=250", 250)] {
-        assert_eq!(places(&[set]), Ok(consumers));
+    for (set, subscribers) in [("limits.subscribers=1", 1), ("limits.subscribers=250", 250)] {
+        assert_eq!(places(&[set]), Ok(subscribers));
     }
     let file =
-        Scratch::new("limits.toml", "[limits]\nconsumers = 40\n[[link]]\nname = \"a\"\nport = \"x\"\n");
-    let of_file = |set: &[&str]| load(&[&file], set).map(|config| config.limits.consumers);
-    assert_eq!((of_file(&[]), of_file(&["limits.consumers=50"])), (Ok(40), Ok(50)));
+        Scratch::new("limits.toml", "[limits]\nsubscribers = 40\n[[link]]\nname = \"a\"\nport = \"x\"\n");
+    let of_file = |set: &[&str]| load(&[&file], set).map(|config| config.limits.subscribers);
+    assert_eq!((of_file(&[]), of_file(&["limits.subscribers=50"])), (Ok(40), Ok(50)));
     for (set, said) in [
-        ("limits.consumers=0", "consumers = 0\n  1 to 250"),
-        ("limits.consumers=251", "consumers = 251\n  1 to 250"),
-        ("limits.consumers=-1", "consumers = -1\n  1 to 250"),
-        ("limits.consumer=1", "did you mean `consumers`?"),
+        ("limits.subscribers=0", "subscribers = 0\n  1 to 250"),
+        ("limits.subscribers=251", "subscribers = 251\n  1 to 250"),
+        ("limits.subscribers=-1", "subscribers = -1\n  1 to 250"),
+        ("limits.subscriber=1", "did you mean `subscribers`?"),
     ] {
         let error = places(&[set]).unwrap_err();
         assert!(error.starts_with(&format!("--set {set}: ")) && error.contains(said), "{error}");
     }
+}
+
+#[test]
+fn old_names_are_errors_that_state_the_new_names() {
+    for (old, new) in [
+        ("[zones]\nself_min = []", "zones.body_mask"),
+        ("[marks]\ni_min = 2", "marks.min_level"),
+        ("[lines]\npolish = true", "lines.refine"),
+        ("[limits]\nconsumers = 40", "limits.subscribers"),
+        ("[link.zones]\nself_min = []", "zones.body_mask"),
+    ] {
+        let file = Scratch::new("old.toml", &format!("[[link]]\nname = \"a\"\nport = \"x\"\n{old}\n"));
+        let error = load(&[&file], &[]).unwrap_err();
+        let key = old.split(['\n', ' ']).nth(1).unwrap();
+        let expected = format!("old.toml:5:1: unknown key `{key}`\n  its new name is `{new}`");
+        assert!(error.contains(&expected), "{error}");
+    }
+    let elsewhere = load(&[], &["zones.polish=true"]).unwrap_err();
+    assert!(elsewhere.contains("did you mean"), "{elsewhere}");
 }
 
 #[test]

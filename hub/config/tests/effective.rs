@@ -50,7 +50,7 @@ fn each_value_has_the_place_where_it_is_said_last() {
     );
     let second = Scratch::new(
         "second.toml",
-        "[zones]\nmargin = 0.01\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\n[background]\n\
+        "[zones]\nmargin = 0.01\nbody_mask = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\n[background]\n\
          method = \"off\"\nscans = 100\nstart = \"first-scan\"\n[[link]]\nname = \"a\"\nbaud = 38400\n",
     );
     let links = ["c=file:/tmp/x?rate=max"];
@@ -68,9 +68,9 @@ fn each_value_has_the_place_where_it_is_said_last() {
         ("link.b.zones.margin", json!(0.01), second.place("2:10")),
         ("link.b.zones.radii", json!([1.2, 0.7]), "--set zones.radii=[1.2,0.7]".to_owned()),
         (
-            "link.a.zones.self_min",
+            "link.a.zones.body_mask",
             json!([{ "from_deg": -77.5, "to_deg": -60.0, "range": 0.42 }]),
-            second.place("3:12"),
+            second.place("3:13"),
         ),
         ("link.b.unit", json!("cm"), first.place("11:8")),
         ("link.a.unit", Json::Null, "default".to_owned()),
@@ -82,7 +82,7 @@ fn each_value_has_the_place_where_it_is_said_last() {
         ("link.a.background.threshold_mm", Json::Null, "default".to_owned()),
         ("link.a.background.start", json!("first-scan"), second.place("8:9")),
         ("link.a.marks.max_range_step", json!(0.1), "default".to_owned()),
-        ("limits.consumers", json!(32), "default".to_owned()),
+        ("limits.subscribers", json!(32), "default".to_owned()),
         ("gateway.ttl", json!(2), first.place("14:7")),
         ("gateway.to", json!(["10.0.0.7:22200"]), first.place("15:6")),
         ("gateway.mtu", json!(1372), "default".to_owned()),
@@ -129,9 +129,9 @@ fn a_link_shows_the_keys_of_its_own_family() {
 #[test]
 fn what_is_shown_can_be_set() {
     let said = [
-        "link.front.zones.self_min=[{from_deg=-1,to_deg=2,range=0.4}]",
+        "link.front.zones.body_mask=[{from_deg=-1,to_deg=2,range=0.4}]",
         "link.front.unit=cm",
-        "limits.consumers=200",
+        "limits.subscribers=200",
         "gateway.ttl=3",
     ];
     let of = |set: &[&str]| sources(&[], &LINKS, set);

@@ -11,15 +11,15 @@ fn sources(set: &[&str]) -> Sources {
 
 #[test]
 fn what_is_said_for_all_links_is_for_those_that_have_it() {
-    let set = ["marks.level=240", "marks.i_min=2", "link.side.marks.level=250"];
+    let set = ["marks.level=240", "marks.min_level=2", "link.side.marks.level=250"];
     let config = Config::load(&sources(&set)).unwrap();
-    let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
+    let marks = |link: &Link| (link.processing.marks.min_level, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(240)), (2, Some(250))));
     let values = values(&sources(&set)).unwrap();
     let shown = |key: &str| values.iter().find(|value| value.key == key).map(|value| value.text());
-    assert_eq!(shown("link.front.marks.i_min").as_deref(), Some("2"));
+    assert_eq!(shown("link.front.marks.min_level").as_deref(), Some("2"));
     assert_eq!(shown("link.side.marks.level").as_deref(), Some("250"));
-    assert_eq!((shown("link.side.marks.i_min"), shown("link.front.marks.level")), (None, None));
+    assert_eq!((shown("link.side.marks.min_level"), shown("link.front.marks.level")), (None, None));
     assert_eq!(Config::load(&sources(&[])).unwrap().links[1].processing.marks.level, None, "no default");
 }
 
@@ -30,11 +30,11 @@ fn what_does_not_fit_is_refused() {
         ("marks.level=65536", "level = 65536\n  a whole number from 1 to 65535"),
         (
             "link.front.marks.level=200",
-            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  i_min is the least",
+            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  min_level is the least",
         ),
         (
-            "link.side.marks.i_min=2",
-            "i_min, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
+            "link.side.marks.min_level=2",
+            "min_level, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
         ),
         ("early.pieces=1", "pieces = 1\n  a whole number from 2 to 8"),
         (

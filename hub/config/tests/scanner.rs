@@ -57,8 +57,9 @@ fn a_link_has_a_family_and_what_its_family_needs() {
         assert_eq!(known(&link), (scanner, rate, beams), "{setting:?}");
     }
     // What is said for all links is for those that have it.
-    let config = load(&[family, "marks.level=240", "marks.i_min=2", "link.front.marks.level=250"]).unwrap();
-    let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
+    let config =
+        load(&[family, "marks.level=240", "marks.min_level=2", "link.front.marks.level=250"]).unwrap();
+    let marks = |link: &Link| (link.processing.marks.min_level, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
     // The other link is what it was.
     assert_eq!(load(&[family]).unwrap().links[1].family(), None);
@@ -134,8 +135,8 @@ fn a_link_has_a_family_and_what_its_family_needs() {
         (&[family], "idle=rest", "idle = \"rest\"\n  one of: run, stop"),
         (
             &[family],
-            "marks.i_min=2",
-            "i_min, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
+            "marks.min_level=2",
+            "min_level, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
         ),
         (
             &[family],

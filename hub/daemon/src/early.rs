@@ -193,7 +193,7 @@ mod tests {
                 })
                 .collect();
             let settings = Settings {
-                self_min: own.clone(),
+                body_mask: own.clone(),
                 margin_mm: random.u16(..50),
                 min_beams: random.u16(1..4),
                 min_scans: random.u16(1..4),
@@ -255,7 +255,7 @@ mod tests {
     fn a_warning_of_the_robots_own_body_is_withdrawn() {
         let at = |degrees: f32, range| Point { angle: -degrees.to_radians(), range, intensity: 9 };
         let own = [Sector { from_mdeg: -95_000, to_mdeg: -85_000, range_mm: 300 }];
-        let settings = Settings { self_min: own.to_vec(), ..Settings::default() };
+        let settings = Settings { body_mask: own.to_vec(), ..Settings::default() };
         let mut check = Check::new(Pose::default(), &settings, BEAMS);
         let mut warner = EarlyWarner::new(BEAMS);
         zones(&mut check, &turn(1, &[at(10.0, 5000)]));

@@ -98,7 +98,7 @@ impl Differences {
         }
         let added = read.links.iter().filter(|link| named(running, &link.name).is_none());
         if running.limits != read.limits {
-            differences.later.push(("limits".to_owned(), vec!["consumers"]));
+            differences.later.push(("limits".to_owned(), vec!["subscribers"]));
         }
         differences.later.extend(added.map(|link| (link.name.clone(), vec!["link added"])));
         differences
@@ -174,8 +174,8 @@ mod tests {
             &[
                 "zones.radii=[2.0]",
                 "link.a.pose.x=0.3",
-                "link.b.marks.i_min=2",
-                "link.b.lines.polish=true",
+                "link.b.marks.min_level=2",
+                "link.b.lines.refine=true",
                 "link.b.motion.max_step=0.3",
                 "link.b.early.pieces=4",
                 "link.b.angle=100",
@@ -183,7 +183,7 @@ mod tests {
                 "link.b.unit=cm",
                 "link.b.baud=38400",
                 "link.b.type=lms200",
-                "limits.consumers=33",
+                "limits.subscribers=33",
             ],
         );
         let Differences { now, later } = Differences::between(&old, &new);
@@ -204,7 +204,7 @@ mod tests {
             [
                 ("b", "port type angle resolution unit baud".to_owned()),
                 ("c", "link removed".to_owned()),
-                ("limits", "consumers".to_owned()),
+                ("limits", "subscribers".to_owned()),
                 ("d", "link added".to_owned()),
             ]
         );

@@ -244,12 +244,12 @@ impl Platform for System<'_> {
     }
 
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
-        let (wanted, topic) = (self.hub.limits.consumers, P::TOPIC.name());
+        let (wanted, topic) = (self.hub.limits.subscribers, P::TOPIC.name());
         let medium = SharedMemory::new(self.hub.node, sensor, &self.hub.limits)?;
         let places = medium.places();
         if places < wanted {
             tracing::warn!(
-                "{sensor}/{topic} has places for {places} consumers, not for {wanted}: those of an earlier hub keep it; stop \
+                "{sensor}/{topic} has places for {places} subscribers, not for {wanted}: those of an earlier hub keep it; stop \
                  them, then start the hub again"
             );
         }

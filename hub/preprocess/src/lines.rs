@@ -29,7 +29,7 @@ pub struct Settings {
     pub min_points: u16,
     /// Whether to use the slower, better form: cuts are moved to where they help most, and beams at the ends of a line
     /// that fit worst are dropped.
-    pub polish: bool,
+    pub refine: bool,
     /// Condition that ends the joining of lines.
     pub stop: Stop,
 }
@@ -47,7 +47,7 @@ pub enum Stop {
 
 impl Default for Settings {
     fn default() -> Self {
-        Settings { max: LINES as u8, min_points: 5, polish: false, stop: Stop::Likelihood }
+        Settings { max: LINES as u8, min_points: 5, refine: false, stop: Stop::Likelihood }
     }
 }
 
@@ -172,7 +172,7 @@ impl LineFinder {
     }
 
     fn bounds(&self, rays: usize, noise: f64) -> Bounds {
-        let Settings { max, min_points, polish, stop } = self.settings;
+        let Settings { max, min_points, refine, stop } = self.settings;
         let penalty = NUMBERS * (rays.max(2) as f64).ln() * noise * noise;
         // If no distance separates points, all of them end on a line.
         let (penalty, variance, loss) = match stop {
@@ -186,10 +186,10 @@ impl LineFinder {
             variance,
             loss,
             min_points: usize::from(min_points),
-            rounds: if polish { 3 } else { 1 },
-            exchange: polish,
+            rounds: if refine { 3 } else { 1 },
+            exchange: refine,
             // 19 of 20 beams still end on a line. In rooms drawn like those of PLE, 97.8 % do.
-            trimmed: if polish { rays / 20 } else { 0 },
+            trimmed: if refine { rays / 20 } else { 0 },
         }
     }
 }

@@ -12,7 +12,7 @@ use crate::search::position;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
     /// Minimum level of a beam of a mark, for scanners whose intensities are reflector levels. 0 counts as 1.
-    pub i_min: u8,
+    pub min_level: u8,
     /// Minimum intensity for other scanners. 0 counts as 1; without a value, these have no marks.
     pub level: Option<u16>,
     /// Maximum difference between the ranges of neighboring beams in a mark, in mm.
@@ -23,7 +23,7 @@ pub struct Settings {
 
 impl Settings {
     /// Settings of the paper.
-    pub const PAPER: Settings = Settings { i_min: 1, level: None, max_range_step_mm: 100, max_gap: 0 };
+    pub const PAPER: Settings = Settings { min_level: 1, level: None, max_range_step_mm: 100, max_gap: 0 };
 }
 
 impl Default for Settings {
@@ -60,7 +60,7 @@ impl MarkDetector {
             return Err(Marks::UNAVAILABLE);
         }
         if Family::of_number(scan.family).is_some_and(Family::has_reflector_levels) {
-            return Ok(u16::from(self.settings.i_min.max(1)));
+            return Ok(u16::from(self.settings.min_level.max(1)));
         }
         self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
     }

@@ -31,7 +31,7 @@ pub struct Settings {
     /// Radii of the circles, the largest first, at most [`ZONES`]. More are ignored.
     pub radii_mm: Vec<u16>,
     /// The robot's own body. Where sectors overlap, the largest range counts.
-    pub self_min: Vec<Sector>,
+    pub body_mask: Vec<Sector>,
     /// Distance that is added to a circle along every beam that meets it.
     pub margin_mm: u16,
     /// Number of beams of a scan that violate a zone; 0 counts as 1.
@@ -51,7 +51,7 @@ impl Default for Settings {
     fn default() -> Self {
         Settings {
             radii_mm: vec![1000, 600],
-            self_min: Vec::new(),
+            body_mask: Vec::new(),
             margin_mm: 0,
             min_beams: 1,
             min_scans: 1,
@@ -290,8 +290,8 @@ impl Table {
         let mut radii_mm = [0; ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
         let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; SECTORS];
-        let count = settings.self_min.len().min(SECTORS);
-        sectors[..count].copy_from_slice(&settings.self_min[..count]);
+        let count = settings.body_mask.len().min(SECTORS);
+        sectors[..count].copy_from_slice(&settings.body_mask[..count]);
         let mut table = Table {
             pose,
             circles,
@@ -348,7 +348,7 @@ impl Table {
 
     /// Returns the beam at a sensor angle.
     fn beam(&self, angle: f64) -> Beam {
-        let own = in_units(self.self_min_mm(angle) as f64, self.layout.unit_mm());
+        let own = in_units(self.body_mask_mm(angle) as f64, self.layout.unit_mm());
         let (sx, sy) = self.sensor_mm();
         if (sx, sy) == (0.0, 0.0) && self.pose.yaw_rad.is_finite() {
             // From the robot's center, all beams are alike, and exact ones are many.
@@ -476,7 +476,7 @@ impl Table {
     }
 
     /// Returns the range at which the robot's own body ends along a beam.
-    fn self_min_mm(&self, angle: f64) -> u64 {
+    fn body_mask_mm(&self, angle: f64) -> u64 {
         let sectors = &self.sectors.0[..self.sectors.1];
         if sectors.is_empty() {
             return 0;

@@ -30,8 +30,8 @@ fn a_scan_takes_nothing_from_the_heap() {
     let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
     let mut check = zones::Check::new(pose, &zones::Settings::default(), BEAMS);
     let mut finder = marks::MarkDetector::new(marks::Settings::default());
-    let of_form = |polish| lines::Settings { polish, ..lines::Settings::default() };
-    let mut line_finders = [false, true].map(|polish| lines::LineFinder::new(pose, of_form(polish), BEAMS));
+    let of_form = |refine| lines::Settings { refine, ..lines::Settings::default() };
+    let mut line_finders = [false, true].map(|refine| lines::LineFinder::new(pose, of_form(refine), BEAMS));
     let mut found_lines = Lines::default();
     let settings = |method| background::Settings { method, scans: Some(10), ..Default::default() };
     let mut models =

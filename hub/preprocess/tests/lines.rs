@@ -147,26 +147,26 @@ fn error(scan: &Scan, lines: &Lines) -> (f64, usize) {
 
 #[test]
 fn all_cuts_find_little_better() {
-    let (mut plain, mut polished, mut best) = (0.0, 0.0, 0.0);
+    let (mut plain, mut refined, mut best) = (0.0, 0.0, 0.0);
     for seed in 0..12 {
         let scan = star(seed, 60);
         let stop = Stop::Number(f64::INFINITY);
-        let settings = Settings { max: 8, min_points: 2, polish: false, stop };
+        let settings = Settings { max: 8, min_points: 2, refine: false, stop };
         let (of_plain, beams) = error(&scan, &find(&scan, Pose::default(), settings));
         assert_eq!(beams, 60, "all end on a line");
-        let polish = Settings { polish: true, ..settings };
-        let (of_polished, beams) = error(&scan, &find(&scan, Pose::default(), polish));
+        let refine = Settings { refine: true, ..settings };
+        let (of_refined, beams) = error(&scan, &find(&scan, Pose::default(), refine));
         assert!(
-            beams >= 57 && of_polished <= 1.000_1 * of_plain,
-            "one in twenty may be left out, {beams} are not: {of_polished} of {of_plain}"
+            beams >= 57 && of_refined <= 1.000_1 * of_plain,
+            "one in twenty may be left out, {beams} are not: {of_refined} of {of_plain}"
         );
         let of_best = slow(&scan, 8);
         assert!(of_plain >= 0.999 * of_best, "nothing is better than the best: {of_plain}, {of_best}");
         plain += of_plain.sqrt();
-        polished += of_polished.sqrt();
+        refined += of_refined.sqrt();
         best += of_best.sqrt();
     }
-    assert!(plain < 1.25 * best && polished < 1.1 * best, "{plain}, {polished}, best {best}");
+    assert!(plain < 1.25 * best && refined < 1.1 * best, "{plain}, {refined}, best {best}");
 }
 
 fn near(one: f32, two: f64, tolerance: f64) -> bool {
@@ -188,8 +188,8 @@ fn a_room_has_four_lines_and_its_corners() {
             let i = ((angle - 0.3) / step).round() as usize;
             Some(room(angle) + noises[i])
         });
-        for polish in [false, true] {
-            let lines = find(&scan, pose, Settings { polish, ..Settings::default() });
+        for refine in [false, true] {
+            let lines = find(&scan, pose, Settings { refine, ..Settings::default() });
             // The wall that beam 0 looks at is cut there.
             assert_eq!((lines.lines().len(), lines.corners().len()), (5, 4), "{lines:?}");
             assert!(near(lines.noise_m, 0.01, 0.002), "{}", lines.noise_m);
@@ -313,8 +313,8 @@ fn input_that_says_nothing() {
         assert_eq!(lines.count, 0, "{lines:?}");
     }
     // Noise: no line is known to better than its points are.
-    for polish in [false, true] {
-        let settings = Settings { polish, ..settings };
+    for refine in [false, true] {
+        let settings = Settings { refine, ..settings };
         let ranges: Vec<f64> = (0..361).map(|_| 3.0 + random.f64()).collect();
         let scan = scan(wide, |angle| Some(ranges[((angle + FRAC_PI_2) / wide.step).round() as usize]));
         let lines = find(&scan, Pose::default(), settings);
@@ -374,7 +374,7 @@ fn any_scan() {
         let settings = Settings {
             max: random.u8(1..=64),
             min_points: random.u16(3..12),
-            polish: random.bool(),
+            refine: random.bool(),
             ..Settings::default()
         };
         let pose = Pose { x_m: random.f64() - 0.5, yaw_rad: random.f64(), ..Pose::default() };

@@ -20,7 +20,7 @@ fn groups(scan: &Scan, settings: Settings) -> Vec<Vec<Hit>> {
     for beam in 0..usize::from(scan.count) {
         let (value, intensity) = (scan.ranges()[beam], scan.upper()[beam]);
         let is_code = value > scan.no_return - 9;
-        if is_code || intensity < settings.i_min.max(1) {
+        if is_code || intensity < settings.min_level.max(1) {
             continue;
         }
         let hit = Hit { beam, range_mm: f64::from(value) * scans::unit_mm(scan), intensity };
@@ -84,7 +84,7 @@ fn marks_are_those_of_the_definition() {
     let (mut marks, mut edges, mut overflows) = (0, 0, 0);
     for _ in 0..2000 {
         let settings = Settings {
-            i_min: random.u8(..4),
+            min_level: random.u8(..4),
             level: [None, Some(200)][random.usize(..2)],
             max_range_step_mm: [0, 50, 100, 1000][random.usize(..4)],
             max_gap: [0, 0, 1, 5][random.usize(..4)],
@@ -177,7 +177,7 @@ fn counts_of_any_surface_are_marks_from_a_level_on() {
     let scan = turn([3, 90, 240, 255, 241, 239, 0, 7]);
     let none = find(&scan, Settings::default());
     assert_eq!((none.count, none.is_available(), none.lacks_level()), (0, false, true));
-    let settings = Settings { level: Some(240), i_min: 7, ..Settings::PAPER };
+    let settings = Settings { level: Some(240), min_level: 7, ..Settings::PAPER };
     let found = find(&scan, settings);
     assert_eq!((found.count, found.is_available(), found.lacks_level()), (1, true, false));
     let mark = found.mark_array[0];

@@ -22,10 +22,10 @@ impl Case {
             let from_mdeg = 250 * random.i32(-360..360);
             Sector { from_mdeg, to_mdeg: from_mdeg + 250 * random.i32(0..80), range_mm: random.u16(..2000) }
         });
-        let self_min = sectors.collect();
+        let body_mask = sectors.collect();
         let settings = Settings {
             radii_mm,
-            self_min,
+            body_mask,
             margin_mm: if random.bool() { 0 } else { random.u16(..200) },
             min_beams: random.u16(1..4),
             min_scans: random.u16(1..4),
@@ -47,7 +47,7 @@ impl Case {
         let angle = self.pose.yaw_rad + sense * (f64::from(mdeg) / 1000.0).to_radians();
         let covers = |sector: &&Sector| sector.from_mdeg <= mdeg && mdeg <= sector.to_mdeg;
         let own =
-            self.settings.self_min.iter().filter(covers).map(|sector| sector.range_mm).max().unwrap_or(0);
+            self.settings.body_mask.iter().filter(covers).map(|sector| sector.range_mm).max().unwrap_or(0);
         ([angle.cos(), angle.sin()], f64::from(own))
     }
 
@@ -421,15 +421,15 @@ fn the_robot_itself_is_neither_near_nor_invalid() {
     let wholly = [Sector { range_mm: 1000, ..partly[0] }, partly[0]];
     let body: Vec<_> = (0..12).map(|i| (i, 399)).collect();
     let blind: Vec<_> = (0..11).map(|i| (i, INVALID)).collect();
-    for (self_min, of_blind) in [(&partly[..], Verdict::Unknown), (&wholly[..], Verdict::Clear)] {
-        let settings = Settings { self_min: self_min.to_vec(), ..Settings::default() };
+    for (body_mask, of_blind) in [(&partly[..], Verdict::Unknown), (&wholly[..], Verdict::Clear)] {
+        let settings = Settings { body_mask: body_mask.to_vec(), ..Settings::default() };
         assert_eq!(verdict(&settings, &scan(&body[..11])), Verdict::Clear);
         assert_eq!(verdict(&settings, &scan(&body)), Verdict::Stop, "beam 11 is none of the body's");
         assert_eq!(verdict(&settings, &scan(&blind)), of_blind);
         let mut check = Check::new(Pose::default(), &settings, 100);
         assert_eq!(zones_after(&mut check, &scan(&body[..11])).nearest(), Some((11, 5000)));
     }
-    let settings = Settings { self_min: partly.to_vec(), ..Settings::default() };
+    let settings = Settings { body_mask: partly.to_vec(), ..Settings::default() };
     assert_eq!(verdict(&settings, &scan(&[(3, 400)])), Verdict::Stop, "where the body ends");
 }
 
@@ -472,11 +472,11 @@ fn a_circle_that_cannot_be_violated_is_never_clear() {
     let more = Settings { min_beams: 101, ..settings.clone() };
     assert_eq!(of(whole, &more, &scan(&[(7, 0)])), (Verdict::Unknown, 100, true));
     let body = [Sector { from_mdeg: -90_000, to_mdeg: -72_000, range_mm: 1000 }];
-    let masked = Settings { self_min: body.to_vec(), ..most.clone() };
+    let masked = Settings { body_mask: body.to_vec(), ..most.clone() };
     assert_eq!(of(whole, &masked, &scan(&[])), (Verdict::Unknown, 89, true));
     let all = [Sector { to_mdeg: 90_000, ..body[0] }];
     assert_eq!(
-        of(whole, &Settings { self_min: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
+        of(whole, &Settings { body_mask: all.to_vec(), ..settings.clone() }, &scan(&[])).0,
         Verdict::Unknown
     );
     // 2 m ahead of the center, the sensor looks away from the circle; turned by 180 degrees, into it.
@@ -535,7 +535,7 @@ fn the_exact_point_counts_where_there_is_one() {
     assert_eq!(of_turn(ahead, &settings, &turn(&[(100, 1001, -182.6)])).zones()[0].beams, 0);
     // The middle of bin 99 is beside the robot's body, a point in it may not be.
     let body = [Sector { from_mdeg: -180_000, to_mdeg: -179_000, range_mm: 2000 }];
-    let masked = Settings { self_min: body.to_vec(), ..settings };
+    let masked = Settings { body_mask: body.to_vec(), ..settings };
     assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -178.3)])).zones()[0].beams, 1);
     assert_eq!(of_turn(ahead, &masked, &turn(&[(99, 1500, -179.3)])).zones()[0].beams, 0);
 }

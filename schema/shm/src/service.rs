@@ -217,10 +217,10 @@ pub(crate) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
 /// Returns the failure if all `limit` places for subscribers of the topic `service` are taken.
 pub(crate) fn no_place(service: &ServiceName, limit: usize) -> Failure {
     let (start, key) = match of_service(service.as_str()) {
-        Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--consumers"),
-        _ => ("configure the hub", "limits.consumers"),
+        Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--subscribers"),
+        _ => ("configure the hub", "limits.subscribers"),
     };
-    let most = TopicLimits::CONSUMERS.end();
+    let most = TopicLimits::SUBSCRIBERS.end();
     let hint = format!(
         "{start} with a greater {key}, up to {most}, or stop some; the places of those that crashed are free again within \
          seconds"
@@ -232,7 +232,7 @@ pub(crate) fn no_place(service: &ServiceName, limit: usize) -> Failure {
 pub(crate) fn full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::Short,
-        format!("{service} has {limit} consumers, the most that are possible"),
+        format!("{service} has {limit} subscribers, the most that are possible"),
         "stop some of them; the places of those that crashed are free again within seconds",
     )
 }
@@ -240,7 +240,7 @@ pub(crate) fn full(service: &ServiceName, limit: usize) -> Failure {
 /// Returns the failure for any other port that cannot be created. As a rule, descriptors or places are short.
 pub(crate) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
     shortage::found(Path::new(shortage::SHARED_MEMORY)).unwrap_or_else(|| {
-        let hint = "too many consumers, or `ulimit -n` is too small: about 4 descriptors for each";
+        let hint = "too many subscribers, or `ulimit -n` is too small: about 4 descriptors for each";
         Failure::new(Kind::Short, format!("no port at {service}: {error:?}"), hint)
     })
 }
@@ -254,7 +254,7 @@ fn failure<S: Service>(node: &Node<S>, service: &ServiceName, failed: OpenFailur
         OpenFailure::Full => Failure::new(
             Kind::Short,
             format!("{service} has no place for another process"),
-            "stop some consumers",
+            "stop some subscribers",
         ),
         OpenFailure::Absent => {
             Failure::new(Kind::Failed, format!("{service} cannot be created"), "remove what is left of it")

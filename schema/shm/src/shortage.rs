@@ -179,7 +179,7 @@ const OPEN_DESCRIPTORS: &str = "/proc/self/fd";
 /// headers, and the lists of each service.
 pub fn sensor_bytes(topics: &[Topic], limits: &TopicLimits) -> u64 {
     let chunk =
-        |&topic: &Topic| limits::samples(topic, limits.consumers) * (topic.longest(limits) + CHUNK_HEADER);
+        |&topic: &Topic| limits::samples(topic, limits.subscribers) * (topic.longest(limits) + CHUNK_HEADER);
     let services = (topics.len() + 1) as u64 * SERVICE;
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }

@@ -146,7 +146,7 @@ macro_rules! payload {
                     };
                     let made = builder()
                         .max_publishers(limits::PUBLISHERS)
-                        .max_subscribers(limits.consumers)
+                        .max_subscribers(limits.subscribers)
                         .max_nodes(limits::NODES)
                         .subscriber_max_buffer_size(limits::buffer($topic))
                         .subscriber_max_borrowed_samples(limits::BORROWED)

@@ -60,7 +60,7 @@ fn a_telegram_is_as_long_as_it_is() {
 }
 
 #[test]
-fn a_late_consumer_gets_the_last_status() {
+fn a_late_subscriber_gets_the_last_status() {
     let place = Place::new();
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let topic = Status::create(&hub, "front", &LIMITS).unwrap();
@@ -121,10 +121,10 @@ fn limits_are_those_of_the_contract() {
     assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
     assert_eq!(limits::samples(Topic::Scan, 32), 64 + 128 + 2);
     assert_eq!(Topic::ALL.map(limits::buffer), [64, 64, 16, 16, 16, 4, 4, 16, 16, 16, 16, 64, 64, 128, 16]);
-    for consumers in [0, 251] {
-        assert_eq!(TopicLimits { consumers, ..LIMITS }.check().unwrap_err().kind, Kind::Configuration);
+    for subscribers in [0, 251] {
+        assert_eq!(TopicLimits { subscribers, ..LIMITS }.check().unwrap_err().kind, Kind::Configuration);
     }
-    let most = TopicLimits { consumers: 250, ..LIMITS };
+    let most = TopicLimits { subscribers: 250, ..LIMITS };
     assert_eq!(most.check(), Ok(()));
     let crowded = Scan::create(&hub, "rear", &most).unwrap();
     let publisher = Scan::publisher(&crowded, &most).unwrap();
@@ -135,40 +135,40 @@ fn limits_are_those_of_the_contract() {
 }
 
 #[test]
-fn a_topic_has_a_place_for_each_of_its_consumers_and_the_next_is_told_the_key() {
+fn a_topic_has_a_place_for_each_of_its_subscribers_and_the_next_is_told_the_key() {
     let place = Place::new();
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
-    let two = TopicLimits { consumers: 2, ..LIMITS };
-    for (sensor, key) in [("front", "limits.consumers"), ("robot1.front", "--consumers")] {
+    let two = TopicLimits { subscribers: 2, ..LIMITS };
+    for (sensor, key) in [("front", "limits.subscribers"), ("robot1.front", "--subscribers")] {
         let topic = Scan::create(&hub, sensor, &two).unwrap();
         let first = [Scan::subscriber(&hub, &topic).unwrap(), Scan::subscriber(&hub, &topic).unwrap()];
         let refused = Scan::subscriber(&hub, &topic).unwrap_err();
         assert_eq!(refused.kind, Kind::Short);
-        assert!(refused.message.contains("has 2 consumers") && refused.hint.contains(key), "{refused}");
+        assert!(refused.message.contains("has 2 subscribers") && refused.hint.contains(key), "{refused}");
         drop(first);
         Scan::subscriber(&hub, &topic).unwrap();
     }
 }
 
 #[test]
-fn a_topic_that_consumers_keep_alive_keeps_its_places() {
+fn a_topic_that_subscribers_keep_alive_keeps_its_places() {
     let place = Place::new();
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
-    let kept = Scan::create(&hub, "front", &TopicLimits { consumers: 2, ..LIMITS }).unwrap();
-    for consumers in [1, 3] {
-        let again = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { consumers, ..LIMITS }).unwrap();
-        assert_eq!(again.places(), 2, "made for {consumers}");
+    let kept = Scan::create(&hub, "front", &TopicLimits { subscribers: 2, ..LIMITS }).unwrap();
+    for subscribers in [1, 3] {
+        let again = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { subscribers, ..LIMITS }).unwrap();
+        assert_eq!(again.places(), 2, "made for {subscribers}");
     }
     drop(kept);
-    let new = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { consumers: 3, ..LIMITS }).unwrap();
+    let new = SharedMemory::<Scan>::new(&hub, "front", &TopicLimits { subscribers: 3, ..LIMITS }).unwrap();
     assert_eq!(new.places(), 3);
 }
 
 const LIMITS: TopicLimits =
-    TopicLimits { consumers: 32, beams: 401, contents: Contents::UPPER, telegram: Telegram::MAX };
+    TopicLimits { subscribers: 32, beams: 401, contents: Contents::UPPER, telegram: Telegram::MAX };
 
 #[test]
-fn consumers_wake_for_every_reason() {
+fn subscribers_wake_for_every_reason() {
     let place = Place::new();
     let hub = scanhub_shm::hub_node(&place.domain).unwrap();
     let waker = Waker::new(&hub, "front").unwrap();

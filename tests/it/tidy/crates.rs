@@ -191,7 +191,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
     // and sectors are made before that.
     on_heap.retain(|place| {
         let (file, line) = place.split_once(": ").unwrap_or_default();
-        let is_setting = ["radii_mm: ", "self_min: ", "pub radii_mm: ", "pub self_min: "];
+        let is_setting = ["radii_mm: ", "body_mask: ", "pub radii_mm: ", "pub body_mask: "];
         if file.starts_with("hub/preprocess/src/zones.rs") && is_setting.iter().any(|it| line.starts_with(it))
         {
             return false;

@@ -134,7 +134,7 @@ impl Board {
     ) -> bool {
         self.attached[sensor] += 1;
         let places = &mut self.sensors[sensor][topic as usize].places;
-        let has_room = places.len() < TopicLimits::default().consumers;
+        let has_room = places.len() < TopicLimits::default().subscribers;
         if has_room {
             let queue = VecDeque::new();
             places.push(Place { consumer, queue, is_connected: false, is_listener, is_dead: false });

@@ -66,7 +66,8 @@ pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<
     let needed = sensor_bytes(&Topic::ALL, &limits);
     if memory < needed {
         let (have, need) = (memory.div_ceil(MEGABYTE), needed.div_ceil(MEGABYTE));
-        let what = format!("--memory {have} has no room for a sensor with {} subscribers", limits.consumers);
+        let what =
+            format!("--memory {have} has no room for a sensor with {} subscribers", limits.subscribers);
         return Err(Failure::new(Kind::Configuration, what, format!("at least {need}")));
     }
     let session = PublishSession::open(domain, &Topic::ALL, limits)?;
