@@ -151,7 +151,7 @@ fn scan(room: &Room, end_ns: Nanos) -> Box<Scan> {
 
 /// Returns whether the background of a beam is a range.
 fn known(range: u16) -> bool {
-    range != Background::UNTAUGHT && range != Background::FAR
+    range != Background::UNKNOWN && range != Background::FAR
 }
 
 fn places(scan: &Scan, ranges: &[u16]) -> Vec<Place> {

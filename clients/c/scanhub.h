@@ -401,7 +401,7 @@ struct scanhub_scan {
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
     /* Number of points that were dropped because another point has the same beam. Points without a return count,
      * too. */
-    uint16_t collapsed;
+    uint16_t collisions;
     uint8_t family; /* Family of the scanner: enum scanhub_family. */
     uint8_t incomplete; /* 1: Packets of the revolution are missing. */
     uint8_t intensity_bits; /* Bits of an intensity; 0 if there are none. */
@@ -432,7 +432,7 @@ static inline enum scanhub_result scanhub_read_scan(const struct scanhub_datagra
     out->valid_to = scanhub_u16(at + 34);
     out->no_return = scanhub_u16(at + 36);
     out->beyond = scanhub_u16(at + 38);
-    out->collapsed = scanhub_u16(at + 40);
+    out->collisions = scanhub_u16(at + 40);
     out->family = at[42];
     out->incomplete = at[43] & 1;
     out->intensity_bits = at[45];
@@ -561,7 +561,7 @@ struct scanhub_foreground {
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segment_count; /* Number of segments, at most 64. */
-    uint16_t left_out; /* Number of segments that did not fit. */
+    uint16_t dropped; /* Number of segments that did not fit. */
     /* Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
      * it. */
     uint64_t supported;
@@ -606,7 +606,7 @@ static inline enum scanhub_result scanhub_read_foreground_arrays(const struct sc
     out->count = scanhub_u16(at + 8);
     out->beams = scanhub_u16(at + 10);
     out->segment_count = scanhub_u16(at + 12);
-    out->left_out = scanhub_u16(at + 14);
+    out->dropped = scanhub_u16(at + 14);
     out->supported = scanhub_u64(at + 16);
     if (scanhub_u16(at + 8) > 8192
         || scanhub_u16(at + 12) > 64
@@ -629,7 +629,7 @@ struct scanhub_background {
      * unit. */
     uint32_t generation;
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t taught; /* Number of beams whose background is known. */
+    uint16_t known_beams; /* Number of beams whose background is known. */
     uint16_t count; /* Number of beams of the model; 0 before the first scan. */
     uint8_t frozen; /* 1: Learning is stopped. */
     /* Ranges in device units; 0 if the background is unknown, 65535 if it is beyond the maximum range. Each has 2
@@ -647,7 +647,7 @@ static inline enum scanhub_result scanhub_read_background(const struct scanhub_d
     out->step = scanhub_f64(at + 8);
     out->generation = scanhub_u32(at + 16);
     out->unit_um = scanhub_u32(at + 20);
-    out->taught = scanhub_u16(at + 24);
+    out->known_beams = scanhub_u16(at + 24);
     out->count = scanhub_u16(at + 26);
     out->frozen = at[28] & 1;
     if (scanhub_u16(at + 26) > 8192
@@ -832,7 +832,7 @@ struct scanhub_motion {
      * large there. */
     uint8_t degenerate;
     /* Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out. */
-    uint16_t breaks;
+    uint16_t refused_steps;
     /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
      * to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. */
     float pose_covariance[9];
@@ -861,7 +861,7 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
     out->method = at[76];
     out->valid = at[76] <= SCANHUB_MOTION_BOTH && at[76] != SCANHUB_MOTION_REFUSED && !(at[77] & 2);
     out->degenerate = at[77] & 1;
-    out->breaks = scanhub_u16(at + 78);
+    out->refused_steps = scanhub_u16(at + 78);
     for (n = 0; n < 9; n++)
         out->pose_covariance[n] = scanhub_f32(at + 80 + 4 * (size_t)n);
     if (!scanhub_are_finite(at, 8, 3)
@@ -1052,7 +1052,7 @@ struct scanhub_cloud {
     uint8_t last; /* 1: The last sample of its sweep. */
     uint8_t complete; /* 1: The sweep went from one reversal of the mount to the next, and no angle was missing. */
     /* 1: The sweep is unreliable, because its angles contradict the background. The class of all points is unknown. */
-    uint8_t doubted;
+    uint8_t unreliable;
     const uint8_t *points; /* The points. See scanhub_point. */
 };
 /* One point. 16 bytes. */
@@ -1089,7 +1089,7 @@ static inline enum scanhub_result scanhub_read_cloud(const struct scanhub_datagr
     out->first = at[10] & 1;
     out->last = at[10] >> 1 & 1;
     out->complete = at[10] >> 2 & 1;
-    out->doubted = at[10] >> 3 & 1;
+    out->unreliable = at[10] >> 3 & 1;
     if (scanhub_u16(at + 8) > 8192
         || datagram->payload_len < 16
             + 16 * (size_t)(out->count))
@@ -1107,12 +1107,12 @@ static inline enum scanhub_result scanhub_read_cloud(const struct scanhub_datagr
 struct scanhub_obstacles {
     uint32_t sweep; /* Number of the sweep, as in topic `cloud`. */
     uint32_t generation; /* Generation of the background, as in topic `cloud`. */
-    uint32_t left_out; /* Number of obstacles that did not fit. */
+    uint32_t dropped; /* Number of obstacles that did not fit. */
     uint8_t count; /* Number of obstacles, at most 64. */
     uint8_t complete; /* 1: The sweep went from one reversal of the mount to the next, and no angle was missing. */
     /* 1: The sweep is unreliable, because its angles contradict the background. The list is empty, whatever the scene
      * contains. */
-    uint8_t doubted;
+    uint8_t unreliable;
     const uint8_t *obstacles; /* The obstacles, the nearest first. See scanhub_obstacle. */
 };
 /* An object that was found in one sweep. Positions are in the robot's frame, in meters: ahead, to the left, above the
@@ -1157,10 +1157,10 @@ static inline enum scanhub_result scanhub_read_obstacles(const struct scanhub_da
         return result;
     out->sweep = scanhub_u32(at);
     out->generation = scanhub_u32(at + 4);
-    out->left_out = scanhub_u32(at + 8);
+    out->dropped = scanhub_u32(at + 8);
     out->count = at[12];
     out->complete = at[13] >> 2 & 1;
-    out->doubted = at[13] >> 3 & 1;
+    out->unreliable = at[13] >> 3 & 1;
     if (at[12] > 64
         || datagram->payload_len < 16
             + 48 * (size_t)(out->count))

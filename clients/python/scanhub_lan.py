@@ -143,7 +143,7 @@ class _ScanHead:
     """Code of a beam without an echo."""
     beyond: int
     """Code of an echo from beyond the range limit; `no_return` if the family has none."""
-    collapsed: int
+    collisions: int
     """Number of points that were dropped because another point has the same beam. Points without a return count,
     too."""
     incomplete: bool
@@ -245,7 +245,7 @@ class _ForegroundHead:
     """Number of beams of the scan."""
     unit_um: int
     """Micrometers per device unit."""
-    left_out: int
+    dropped: int
     """Number of segments that did not fit."""
 
 
@@ -256,7 +256,7 @@ class Background:
     generation: int
     """Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
     unit."""
-    taught: int
+    known_beams: int
     """Number of beams whose background is known."""
     count: int
     """Number of beams of the model; 0 before the first scan."""
@@ -408,7 +408,7 @@ class Motion:
     degenerate: bool
     """The surroundings do not show how far the robot moved in some direction, as in a corridor. The covariance is large
     there."""
-    breaks: int
+    refused_steps: int
     """Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out."""
     pose_covariance: "tuple[float, ...]"
     """Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
@@ -548,7 +548,7 @@ class Cloud:
     """The last sample of its sweep."""
     complete: bool
     """The sweep went from one reversal of the mount to the next, and no angle was missing."""
-    doubted: bool
+    unreliable: bool
     """The sweep is unreliable, because its angles contradict the background. The class of all points is unknown."""
     points: "tuple[Point, ...]"
     """The points."""
@@ -590,10 +590,10 @@ class Obstacles:
     """Generation of the background, as in topic `cloud`."""
     complete: bool
     """The sweep went from one reversal of the mount to the next, and no angle was missing."""
-    doubted: bool
+    unreliable: bool
     """The sweep is unreliable, because its angles contradict the background. The list is empty, whatever the scene
     contains."""
-    left_out: int
+    dropped: int
     """Number of obstacles that did not fit."""
     obstacles: "tuple[Obstacle, ...]"
     """The obstacles, the nearest first."""
@@ -964,7 +964,7 @@ def _scan_head(payload: bytes) -> "tuple[dict, dict]":
     _limit(all(map(math.isfinite, v[0:3])))
     _limit(0 <= v[13] <= 7)
     names = (
-        "first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return beyond collapsed family "
+        "first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return beyond collisions family "
         "flags contents intensity_bits turns turn_ns"
     ).split()
     fields = dict(
@@ -981,7 +981,7 @@ def _scan_head(payload: bytes) -> "tuple[dict, dict]":
         valid_to=v[7],
         no_return=v[8],
         beyond=v[9],
-        collapsed=v[10],
+        collisions=v[10],
         incomplete=bool(v[12] & 1),
         intensity_bits=v[14],
     )
@@ -1053,13 +1053,13 @@ def _foreground_head(payload: bytes) -> "tuple[dict, dict]":
     _limit(v[2] <= 8192)
     _limit(v[4] <= 64)
     names = (
-        "generation unit_um count beams segments left_out supported"
+        "generation unit_um count beams segments dropped supported"
     ).split()
     fields = dict(
         generation=v[0],
         count=v[2],
         unit_um=v[1],
-        left_out=v[5],
+        dropped=v[5],
     )
     return fields, dict(zip(names, v))
 
@@ -1071,7 +1071,7 @@ def _background(payload: bytes) -> Background:
     ranges = struct.unpack_from(f"<{v[5]}H", payload, 32)
     return Background(
         generation=v[2],
-        taught=v[4],
+        known_beams=v[4],
         count=v[5],
         unit_um=v[3],
         first_angle=v[0],
@@ -1178,7 +1178,7 @@ def _motion(payload: bytes) -> Motion:
         method=_name(METHODS, v[16], "refused"),
         valid=_name(METHODS, v[16], "refused") != "refused" and not v[17] & 2,
         degenerate=bool(v[17] & 1),
-        breaks=v[18],
+        refused_steps=v[18],
         pose_covariance=v[19:28],
     )
 
@@ -1284,7 +1284,7 @@ def _cloud(payload: bytes) -> Cloud:
         first=bool(v[3] & 1),
         last=bool(v[3] & 2),
         complete=bool(v[3] & 4),
-        doubted=bool(v[3] & 8),
+        unreliable=bool(v[3] & 8),
         points=points,
     )
 
@@ -1313,8 +1313,8 @@ def _obstacles(payload: bytes) -> Obstacles:
         sweep=v[0],
         generation=v[1],
         complete=bool(v[4] & 4),
-        doubted=bool(v[4] & 8),
-        left_out=v[2],
+        unreliable=bool(v[4] & 8),
+        dropped=v[2],
         obstacles=obstacles,
     )
 

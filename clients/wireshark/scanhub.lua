@@ -159,7 +159,7 @@ field("scan.count", "uint16", "Number of beams, at most 8192")
 field("scan.valid_to", "uint16", "Highest value that is a range")
 field("scan.no_return", "uint16", "Code of a beam without an echo")
 field("scan.beyond", "uint16", "Code of an echo from beyond the range limit")
-field("scan.collapsed", "uint16", "Number of points that were dropped because another point has the same beam")
+field("scan.collisions", "uint16", "Number of points that were dropped because another point has the same beam")
 field("scan.family", "uint8", "Family of the scanner", base.DEC, FAMILIES)
 field("scan.incomplete", "uint8", "Incomplete", base.DEC, nil, 1)
 field("scan.contents", "uint8", "Arrays that follow the head", base.HEX)
@@ -193,7 +193,7 @@ field("foreground.unit_um", "uint32", "Micrometers per device unit")
 field("foreground.count", "uint16", "Number of beams of the scan")
 field("foreground.beams", "uint16", "Number of beams in the foreground")
 field("foreground.segments", "uint16", "Number of segments, at most 64")
-field("foreground.left_out", "uint16", "Number of segments that did not fit")
+field("foreground.dropped", "uint16", "Number of segments that did not fit")
 field("foreground.supported", "uint64",
     "Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near it")
 field("foreground.first", "uint16", "First beam")
@@ -206,7 +206,7 @@ field("background.first_angle", "double", "Angle of beam 0 in radians, as in a s
 field("background.step", "double", "Angle from one beam to the next in radians")
 field("background.generation", "uint32", "Number of the model in this run of the hub")
 field("background.unit_um", "uint32", "Micrometers per device unit")
-field("background.taught", "uint16", "Number of beams whose background is known")
+field("background.known_beams", "uint16", "Number of beams whose background is known")
 field("background.count", "uint16", "Number of beams of the model")
 field("background.frozen", "uint8", "Frozen", base.DEC, nil, 1)
 field("background.range", "uint16", "Ranges in device units")
@@ -262,7 +262,7 @@ field("motion.overlap", "float",
 field("motion.method", "uint8", "Method", base.DEC, METHODS)
 field("motion.valid", "uint8", "Whether the summed pose is known, and none of its steps was degenerate")
 field("motion.degenerate", "uint8", "Degenerate", base.DEC, nil, 1)
-field("motion.breaks", "uint16", "Steps that were refused since the start")
+field("motion.refused_steps", "uint16", "Steps that were refused since the start")
 field("motion.pose_covariance", "float",
     "Covariance of the summed pose in the frame of the start, in the layout of covariance")
 field("early.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
@@ -302,7 +302,7 @@ field("cloud.count", "uint16", "Number of points, at most 8192")
 field("cloud.first", "uint8", "First", base.DEC, nil, 1)
 field("cloud.last", "uint8", "Last", base.DEC, nil, 2)
 field("cloud.complete", "uint8", "Complete", base.DEC, nil, 4)
-field("cloud.doubted", "uint8", "Doubted", base.DEC, nil, 8)
+field("cloud.unreliable", "uint8", "Unreliable", base.DEC, nil, 8)
 field("cloud.x_m", "float", "Meters ahead of the robot's center")
 field("cloud.y_m", "float", "Meters to the left of the center")
 field("cloud.z_m", "float", "Meters above the floor")
@@ -310,10 +310,10 @@ field("cloud.beam", "uint16", "Index of the beam in its scan")
 field("cloud.class", "uint8", "Class of the point", base.DEC, POINT_CLASSES)
 field("obstacles.sweep", "uint32", "Number of the sweep, as in topic cloud")
 field("obstacles.generation", "uint32", "Generation of the background, as in topic cloud")
-field("obstacles.left_out", "uint32", "Number of obstacles that did not fit")
+field("obstacles.dropped", "uint32", "Number of obstacles that did not fit")
 field("obstacles.count", "uint8", "Number of obstacles, at most 64")
 field("obstacles.complete", "uint8", "Complete", base.DEC, nil, 4)
-field("obstacles.doubted", "uint8", "Doubted", base.DEC, nil, 8)
+field("obstacles.unreliable", "uint8", "Unreliable", base.DEC, nil, 8)
 field("obstacles.x_m", "float", "Meters ahead of the robot's center")
 field("obstacles.y_m", "float", "Meters to the left of the center")
 field("obstacles.z_m", "float", "Meters above the floor")
@@ -587,7 +587,7 @@ local function scan_head(payload)
         valid_to = payload(34, 2):le_uint(),
         no_return = payload(36, 2):le_uint(),
         beyond = payload(38, 2):le_uint(),
-        collapsed = payload(40, 2):le_uint(),
+        collisions = payload(40, 2):le_uint(),
         family = payload(42, 1):le_uint(),
         flags = payload(43, 1):le_uint(),
         contents = payload(44, 1):le_uint(),
@@ -608,7 +608,7 @@ local function add_scan(tree, payload)
     tree:add_le(f["scan.valid_to"], payload(34, 2))
     tree:add_le(f["scan.no_return"], payload(36, 2))
     tree:add_le(f["scan.beyond"], payload(38, 2))
-    tree:add_le(f["scan.collapsed"], payload(40, 2))
+    tree:add_le(f["scan.collisions"], payload(40, 2))
     tree:add_le(f["scan.family"], payload(42, 1))
     tree:add_le(f["scan.incomplete"], payload(43, 1))
     tree:add_le(f["scan.contents"], payload(44, 1))
@@ -691,7 +691,7 @@ local function foreground_head(payload)
         count = payload(8, 2):le_uint(),
         beams = payload(10, 2):le_uint(),
         segments = payload(12, 2):le_uint(),
-        left_out = payload(14, 2):le_uint(),
+        dropped = payload(14, 2):le_uint(),
     }
 end
 
@@ -701,7 +701,7 @@ local function add_foreground(tree, payload)
     tree:add_le(f["foreground.count"], payload(8, 2))
     tree:add_le(f["foreground.beams"], payload(10, 2))
     tree:add_le(f["foreground.segments"], payload(12, 2))
-    tree:add_le(f["foreground.left_out"], payload(14, 2))
+    tree:add_le(f["foreground.dropped"], payload(14, 2))
     tree:add_le(f["foreground.supported"], payload(16, 8))
 end
 
@@ -715,7 +715,7 @@ unpack_payload[6] = function(payload, tree)
     tree:add_le(f["background.step"], payload(8, 8))
     tree:add_le(f["background.generation"], payload(16, 4))
     tree:add_le(f["background.unit_um"], payload(20, 4))
-    tree:add_le(f["background.taught"], payload(24, 2))
+    tree:add_le(f["background.known_beams"], payload(24, 2))
     tree:add_le(f["background.count"], payload(26, 2))
     tree:add_le(f["background.frozen"], payload(28, 1))
     for i = 0, count - 1 do
@@ -829,7 +829,7 @@ unpack_payload[9] = function(payload, tree)
     local is_valid = METHODS[method] and method ~= 1 and payload(77, 1):le_uint() % 4 < 2
     tree:add(f["motion.valid"], payload(77, 1), is_valid and 1 or 0)
     tree:add_le(f["motion.degenerate"], payload(77, 1))
-    tree:add_le(f["motion.breaks"], payload(78, 2))
+    tree:add_le(f["motion.refused_steps"], payload(78, 2))
     if payload:len() >= 120 then
         for i = 0, 8 do
             tree:add_le(f["motion.pose_covariance"], payload(80 + 4 * i, 4))
@@ -953,7 +953,7 @@ unpack_payload[14] = function(payload, tree)
     tree:add_le(f["cloud.first"], payload(10, 1))
     tree:add_le(f["cloud.last"], payload(10, 1))
     tree:add_le(f["cloud.complete"], payload(10, 1))
-    tree:add_le(f["cloud.doubted"], payload(10, 1))
+    tree:add_le(f["cloud.unreliable"], payload(10, 1))
     for i = 0, count - 1 do
         local at = 16 + 16 * i
         add_cloud_point(tree:add(payload(at, 16), "CloudPoint " .. i), payload, at)
@@ -962,7 +962,7 @@ unpack_payload[14] = function(payload, tree)
     if payload(10, 1):le_uint() % 2 >= 1 then words = words .. ", first" end
     if payload(10, 1):le_uint() % 4 >= 2 then words = words .. ", last" end
     if payload(10, 1):le_uint() % 8 >= 4 then words = words .. ", complete" end
-    if payload(10, 1):le_uint() % 16 >= 8 then words = words .. ", doubted" end
+    if payload(10, 1):le_uint() % 16 >= 8 then words = words .. ", unreliable" end
     return words
 end
 
@@ -993,17 +993,17 @@ unpack_payload[15] = function(payload, tree)
     end
     tree:add_le(f["obstacles.sweep"], payload(0, 4))
     tree:add_le(f["obstacles.generation"], payload(4, 4))
-    tree:add_le(f["obstacles.left_out"], payload(8, 4))
+    tree:add_le(f["obstacles.dropped"], payload(8, 4))
     tree:add_le(f["obstacles.count"], payload(12, 1))
     tree:add_le(f["obstacles.complete"], payload(13, 1))
-    tree:add_le(f["obstacles.doubted"], payload(13, 1))
+    tree:add_le(f["obstacles.unreliable"], payload(13, 1))
     for i = 0, count - 1 do
         local at = 16 + 48 * i
         add_obstacle(tree:add(payload(at, 48), "Obstacle " .. i), payload, at)
     end
     local words = count .. " obstacles"
     if payload(13, 1):le_uint() % 8 >= 4 then words = words .. ", complete" end
-    if payload(13, 1):le_uint() % 16 >= 8 then words = words .. ", doubted" end
+    if payload(13, 1):le_uint() % 16 >= 8 then words = words .. ", unreliable" end
     return words
 end
 -- End of payloads.

@@ -99,8 +99,7 @@ impl Convert {
     }
 
     fn words(&self, converted: &Converted) -> String {
-        let Converted { telegrams, scans, marks, left_out, unread, took_ns, encoding, damage, .. } =
-            converted;
+        let Converted { telegrams, scans, marks, dropped, unread, took_ns, encoding, damage, .. } = converted;
         let what = match marks {
             Some(marks) => format!("{marks} marks in {scans} scans"),
             None => format!("{telegrams} telegrams, {scans} scans"),
@@ -112,10 +111,10 @@ impl Convert {
         if let Some(encoding) = encoding {
             words += &format!("; the log was read as {encoding}");
         }
-        if *left_out > 0 {
+        if *dropped > 0 {
             let (plural, what) =
-                if *left_out == 1 { ("", "a complete scan") } else { ("s", "complete scans") };
-            words += &format!("; {left_out} telegram{plural} dropped (not {what})");
+                if *dropped == 1 { ("", "a complete scan") } else { ("s", "complete scans") };
+            words += &format!("; {dropped} telegram{plural} dropped (not {what})");
         }
         if *unread != Unread::default() {
             words += &format!("; dropped from the log: {unread}");
@@ -138,7 +137,7 @@ struct Line<'a> {
     sensors: &'a [String],
     telegrams: u64,
     scans: u64,
-    left_out: u64,
+    dropped: u64,
     seconds: Option<f64>,
     missing: Missing,
     marks: Option<u64>,
@@ -182,7 +181,7 @@ impl<'a> Line<'a> {
             sensors: &converted.sensors,
             telegrams: converted.telegrams,
             scans: converted.scans,
-            left_out: converted.left_out,
+            dropped: converted.dropped,
             seconds: converted.took_ns.map(seconds),
             missing: Missing {
                 telegrams,

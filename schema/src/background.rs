@@ -26,7 +26,7 @@ pub struct BackgroundHead {
     /// Micrometers per device unit.
     pub unit_um: u32,
     /// Number of beams whose background is known.
-    pub taught: u16,
+    pub known_beams: u16,
     /// Number of beams of the model; 0 before the first scan.
     pub count: u16,
     /// Flags: [`Background::FROZEN`].
@@ -52,7 +52,7 @@ packed_as_is!(Background);
 
 impl Background {
     /// Range of a beam whose background is unknown.
-    pub const UNTAUGHT: u16 = 0;
+    pub const UNKNOWN: u16 = 0;
     /// Range of a beam whose background is beyond the sensor's maximum range.
     pub const FAR: u16 = u16::MAX;
     /// Flag: learning is stopped.
@@ -80,7 +80,7 @@ impl Background {
         cast_slice_mut(&mut self.memory_mut()[Background::HEAD..Background::len(head.count.into())])
     }
 
-    /// Returns the ranges of the beams in device units. A range can be [`Background::UNTAUGHT`] or [`Background::FAR`].
+    /// Returns the ranges of the beams in device units. A range can be [`Background::UNKNOWN`] or [`Background::FAR`].
     pub fn ranges(&self) -> &[u16] {
         let room = self.memory().len().saturating_sub(Background::HEAD) / 2;
         let beams = usize::from(self.count).min(room);
@@ -145,7 +145,7 @@ pub struct ForegroundHead {
     /// Number of segments, at most [`SEGMENTS`].
     pub segments: u16,
     /// Number of segments that did not fit.
-    pub left_out: u16,
+    pub dropped: u16,
     /// Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
     /// it.
     pub supported: u64,
@@ -287,10 +287,10 @@ impl Packed for Foreground {
         };
         let used = fixed(self, room)?;
         let fit = self.segments().len().min((room.len() - used) / size_of::<Segment>());
-        let left_out = usize::from(self.left_out) + self.segments().len() - fit;
-        let left_out = left_out.min(usize::from(u16::MAX)) as u16;
+        let dropped = usize::from(self.dropped) + self.segments().len() - fit;
+        let dropped = dropped.min(usize::from(u16::MAX)) as u16;
         let supported = self.supported & first_bits(fit);
-        let used = fixed(&ForegroundHead { segments: fit as u16, left_out, supported, ..**self }, room)?;
+        let used = fixed(&ForegroundHead { segments: fit as u16, dropped, supported, ..**self }, room)?;
         Some(used + write(&mut room[used..], &[cast_slice(&self.segments()[..fit])])?)
     }
 
@@ -384,7 +384,8 @@ mod tests {
 
     #[test]
     fn models_go_there_and_back() {
-        let head = BackgroundHead { generation: 3, taught: 2, unit_um: 10_000, ..BackgroundHead::default() };
+        let head =
+            BackgroundHead { generation: 3, known_beams: 2, unit_um: 10_000, ..BackgroundHead::default() };
         let model = Background::of(head, &[400, 0, Background::FAR]);
         assert_eq!(model.bytes().len(), 38);
         assert_eq!(Background::read(model.bytes()), Some(model.clone()));

@@ -38,7 +38,7 @@ pub struct Motion {
     /// Flags: [`Motion::DEGENERATE`], [`Motion::OPEN`].
     pub flags: u8,
     /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
-    pub breaks: u16,
+    pub refused_steps: u16,
     /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`]. Refused steps add
     /// nothing to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. See
     /// [`Motion::sum_covariance`].

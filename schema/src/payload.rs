@@ -431,7 +431,7 @@ mod tests {
             count: 361,
             beams: 64,
             segments: 64,
-            left_out: 3,
+            dropped: 3,
             supported: 0xF0F0_0000_0000_F5A3,
             ..ForegroundHead::default()
         };
@@ -452,7 +452,7 @@ mod tests {
         assert_eq!(foreground.pack(&mut room), Some(24 + 46 + 128 + 160));
         let mut back = Foreground::zeroed(Foreground::len(361));
         assert!(back.unpack(&room));
-        assert_eq!((back.segments, back.left_out, back.supported), (10, 57, 0x1A3));
+        assert_eq!((back.segments, back.dropped, back.supported), (10, 57, 0x1A3));
         assert_eq!(back.segments(), &foreground.segments()[..10]);
         assert!(back.readings().eq(foreground.readings()));
         let mut whole = [0; 2000];
@@ -509,7 +509,8 @@ mod tests {
 
     #[test]
     fn a_motion_goes_there_and_back() {
-        let mut motion = Motion { x_m: -1.5, dyaw_rad: 0.25, method: 5, breaks: 3, ..Motion::default() };
+        let mut motion =
+            Motion { x_m: -1.5, dyaw_rad: 0.25, method: 5, refused_steps: 3, ..Motion::default() };
         motion.pose_covariance[8] = 0.5;
         let (mut room, mut back) = ([0xAA; 127], Motion::default());
         assert_eq!((motion.pack(&mut room[..119]), motion.pack(&mut room)), (None, Some(120)));

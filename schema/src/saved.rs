@@ -22,7 +22,7 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
         class: &'static str,
         sensor: &'a str,
         generation: u32,
-        taught: u16,
+        known_beams: u16,
         #[serde(serialize_with = "unit_in_mm")]
         unit_mm: u32,
         count: u16,
@@ -39,7 +39,7 @@ pub fn as_json<'a>(sensor: &'a str, model: &'a Background) -> impl Serialize + '
         class: CLASS,
         sensor,
         generation: model.generation,
-        taught: model.taught,
+        known_beams: model.known_beams,
         unit_mm: model.unit_um,
         count: model.count,
         first_angle_deg: in_degrees(model.first_angle),
@@ -77,7 +77,7 @@ struct Head {
 struct File {
     sensor: String,
     generation: u32,
-    taught: usize,
+    known_beams: usize,
     unit_mm: f64,
     count: u16,
     first_angle_deg: f64,
@@ -114,7 +114,7 @@ impl File {
                 flags: if self.frozen { Background::FROZEN } else { 0 },
                 ..BackgroundHead::default()
             },
-            &vec![Background::UNTAUGHT; count.into()],
+            &vec![Background::UNKNOWN; count.into()],
         );
         let slots = model.ranges_mut();
         if self.ranges.len() != usize::from(count) {
@@ -129,19 +129,19 @@ impl File {
         }
         for &beam in &self.far {
             match slots.get_mut(beam) {
-                Some(slot @ &mut Background::UNTAUGHT) => *slot = Background::FAR,
+                Some(slot @ &mut Background::UNKNOWN) => *slot = Background::FAR,
                 Some(_) => return Err(format!("beam {beam} is far twice, or has a range")),
                 None => return Err(format!("beam {beam} is far, and there are {count}")),
             }
         }
-        let taught = model.ranges().iter().filter(|&&range| range != Background::UNTAUGHT).count();
-        if self.taught != taught {
-            return Err(format!("taught is {}, and {taught} beams are", self.taught));
+        let known_beams = model.ranges().iter().filter(|&&range| range != Background::UNKNOWN).count();
+        if self.known_beams != known_beams {
+            return Err(format!("known_beams is {}, and {known_beams} beams are", self.known_beams));
         }
-        if taught == 0 {
+        if known_beams == 0 {
             return Err("it knows no beam".to_owned());
         }
-        model.taught = taught as u16;
+        model.known_beams = known_beams as u16;
         Ok(model)
     }
 
@@ -183,7 +183,7 @@ pub fn unit_in_mm<S: Serializer>(unit_um: &u32, serializer: S) -> Result<S::Ok, 
 }
 
 fn known_ranges<S: Serializer>(ranges: &[u16], serializer: S) -> Result<S::Ok, S::Error> {
-    let is_known = |range: &u16| *range != Background::UNTAUGHT && *range != Background::FAR;
+    let is_known = |range: &u16| *range != Background::UNKNOWN && *range != Background::FAR;
     serializer.collect_seq(ranges.iter().map(|range| Some(*range).filter(is_known)))
 }
 
@@ -207,7 +207,7 @@ mod tests {
             first_angle: first_angle_deg.to_radians(),
             step: step_deg.to_radians(),
             generation: 3,
-            taught: 3,
+            known_beams: 3,
             unit_um: 10_000,
             ..BackgroundHead::default()
         };
@@ -240,8 +240,7 @@ mod tests {
         }
         let turning = model(450, 0.0, -0.8);
         assert_eq!(SavedModel::parse(text(&turning).as_bytes(), "m").unwrap().model, turning);
-        let begin =
-            r#"{"class":"background","sensor":"front","generation":3,"taught":3,"unit_mm":10,"count":101,"#;
+        let begin = r#"{"class":"background","sensor":"front","generation":3,"known_beams":3,"unit_mm":10,"count":101,"#;
         let then =
             r#""first_angle_deg":-50.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,null,65519,null,"#;
         assert!(text(&lms(101)).starts_with(&[begin, then].concat()));
@@ -260,8 +259,8 @@ mod tests {
     #[test]
     fn a_model_that_knows_nothing_is_none() {
         let mut empty = lms(361);
-        empty.ranges_mut().fill(Background::UNTAUGHT);
-        empty.taught = 0;
+        empty.ranges_mut().fill(Background::UNKNOWN);
+        empty.known_beams = 0;
         let failure = SavedModel::parse(text(&empty).as_bytes(), "m").unwrap_err();
         let expected = "m is no background model: it knows no beam";
         assert_eq!((failure.kind, failure.message.as_str()), (Kind::Input, expected));
@@ -300,7 +299,7 @@ mod tests {
             ("[2]", "[181]", "beam 181 is far, and there are 181"),
             ("[2]", "[2,2]", "beam 2 is far twice, or has a range"),
             ("[2]", "[0]", "beam 0 is far twice, or has a range"),
-            ("\"taught\":3", "\"taught\":4", "taught is 4, and 3 beams are"),
+            ("\"known_beams\":3", "\"known_beams\":4", "known_beams is 4, and 3 beams are"),
             ("[2]}", "[2]}{}", "trailing characters"),
         ] {
             assert!(whole.contains(from), "{from}");

@@ -57,7 +57,7 @@ pub struct ScanHead {
     /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has none.
     pub beyond: u16,
     /// Number of points that were dropped because another point has the same beam. Points without a return count, too.
-    pub collapsed: u16,
+    pub collisions: u16,
     /// Family of the scanner: [`Family`].
     pub family: u8,
     /// Flags: [`Scan::INCOMPLETE`].

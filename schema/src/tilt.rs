@@ -57,7 +57,7 @@ pub struct CloudHead {
     pub generation: u32,
     /// Number of points, at most [`BEAMS`](crate::BEAMS).
     pub count: u16,
-    /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`DOUBTED`](Cloud::DOUBTED).
+    /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`UNRELIABLE`](Cloud::UNRELIABLE).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 5],
@@ -130,7 +130,7 @@ impl Cloud {
     /// Flag: the sweep went from one reversal of the mount to the next, and no angle was missing.
     pub const COMPLETE: u8 = 4;
     /// Flag: the sweep is unreliable, because its angles contradict the background. The class of all points is unknown.
-    pub const DOUBTED: u8 = 8;
+    pub const UNRELIABLE: u8 = 8;
 
     /// Returns the length in bytes of a cloud of `points` points.
     pub const fn len(points: usize) -> usize {
@@ -251,10 +251,10 @@ pub struct Obstacles {
     /// Generation of the background, as in topic `cloud`.
     pub generation: u32,
     /// Number of obstacles that did not fit.
-    pub left_out: u32,
+    pub dropped: u32,
     /// Number of obstacles, at most [`OBSTACLES`].
     pub count: u8,
-    /// Flags: [`COMPLETE`](Self::COMPLETE), [`DOUBTED`](Self::DOUBTED).
+    /// Flags: [`COMPLETE`](Self::COMPLETE), [`UNRELIABLE`](Self::UNRELIABLE).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 2],
@@ -319,7 +319,7 @@ impl Obstacles {
     pub const COMPLETE: u8 = 4;
     /// Flag: the sweep is unreliable, because its angles contradict the background. The list is empty, whatever the
     /// scene contains.
-    pub const DOUBTED: u8 = 8;
+    pub const UNRELIABLE: u8 = 8;
 
     /// Returns the obstacles, the nearest first.
     pub fn obstacles(&self) -> &[Obstacle] {
@@ -333,7 +333,7 @@ impl Obstacles {
                 *place = obstacle;
                 self.count += 1;
             }
-            None => self.left_out += 1,
+            None => self.dropped += 1,
         }
     }
 
@@ -408,8 +408,8 @@ mod tests {
     fn what_is_too_many_is_left_out() {
         let mut found = Obstacles { flags: Obstacles::COMPLETE, ..Obstacles::default() };
         (0..=OBSTACLES as u32).for_each(|points| found.push(Obstacle { points, ..Obstacle::default() }));
-        assert_eq!((found.obstacles().len(), found.left_out), (OBSTACLES, 1));
+        assert_eq!((found.obstacles().len(), found.dropped), (OBSTACLES, 1));
         assert_eq!(found.obstacles()[OBSTACLES - 1].points, OBSTACLES as u32 - 1);
-        assert!(found.has(Obstacles::COMPLETE) && !found.has(Obstacles::DOUBTED));
+        assert!(found.has(Obstacles::COMPLETE) && !found.has(Obstacles::UNRELIABLE));
     }
 }

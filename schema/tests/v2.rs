@@ -151,7 +151,7 @@ fn foreground_layout() {
     assert_eq!((size_of::<ForegroundWord>(), align_of::<ForegroundWord>()), (8, 8));
     assert_eq!((offset_of!(ForegroundHead, generation), offset_of!(ForegroundHead, unit_um)), (0, 4));
     assert_eq!((offset_of!(ForegroundHead, count), offset_of!(ForegroundHead, beams)), (8, 10));
-    assert_eq!((offset_of!(ForegroundHead, segments), offset_of!(ForegroundHead, left_out)), (12, 14));
+    assert_eq!((offset_of!(ForegroundHead, segments), offset_of!(ForegroundHead, dropped)), (12, 14));
     assert_eq!(offset_of!(ForegroundHead, supported), 16);
     assert_eq!((size_of::<Segment>(), align_of::<Segment>(), SEGMENTS), (16, 4, 64));
     assert_eq!((offset_of!(Segment, first), offset_of!(Segment, last)), (0, 2));
@@ -169,7 +169,7 @@ fn foreground_bytes() {
         count: 401,
         beams: 1,
         segments: 64,
-        left_out: 0x0104,
+        dropped: 0x0104,
         supported: 0x8000_0000_0000_0206,
     });
     arrays.segments[63] = Segment { first: 400, last: 0x0105, nearest: 6, width: 7, x_mm: -2, y_mm: 8 };
@@ -192,9 +192,9 @@ fn background_layout() {
     assert_eq!((size_of::<BackgroundWord>(), align_of::<BackgroundWord>()), (8, 8));
     assert_eq!((offset_of!(BackgroundHead, first_angle), offset_of!(BackgroundHead, step)), (0, 8));
     assert_eq!((offset_of!(BackgroundHead, generation), offset_of!(BackgroundHead, unit_um)), (16, 20));
-    assert_eq!((offset_of!(BackgroundHead, taught), offset_of!(BackgroundHead, count)), (24, 26));
+    assert_eq!((offset_of!(BackgroundHead, known_beams), offset_of!(BackgroundHead, count)), (24, 26));
     assert_eq!((offset_of!(BackgroundHead, flags), offset_of!(BackgroundHead, reserved)), (28, 29));
-    assert_eq!((Background::UNTAUGHT, Background::FAR, Background::len(401)), (0, 0xFFFF, 834));
+    assert_eq!((Background::UNKNOWN, Background::FAR, Background::len(401)), (0, 0xFFFF, 834));
 }
 
 #[test]
@@ -204,7 +204,7 @@ fn background_bytes() {
         step: -1.5,
         generation: 0x0001_0203,
         unit_um: 10_000,
-        taught: 0x0104,
+        known_beams: 0x0104,
         flags: Background::FROZEN,
         ..BackgroundHead::default()
     };
@@ -333,7 +333,7 @@ fn request_bytes() {
 #[test]
 fn response_bytes() {
     assert_eq!(Response(Ok(None)).encode(), [0, 0, 0, 0]);
-    let head = BackgroundHead { step: 0.5, unit_um: 1000, taught: 1, ..BackgroundHead::default() };
+    let head = BackgroundHead { step: 0.5, unit_um: 1000, known_beams: 1, ..BackgroundHead::default() };
     let model = Background::of(head, &[0x1234]);
     let bytes =
         golden(34, &[(8, &0.5_f64.to_le_bytes()), (20, &[0xE8, 3, 0, 0, 1, 0, 1]), (32, &[0x34, 0x12])]);
@@ -354,7 +354,7 @@ fn scan_layout() {
     assert_eq!((offset_of!(ScanHead, first_beam_ns), offset_of!(ScanHead, unit_um)), (24, 28));
     assert_eq!((offset_of!(ScanHead, count), offset_of!(ScanHead, valid_to)), (32, 34));
     assert_eq!((offset_of!(ScanHead, no_return), offset_of!(ScanHead, beyond)), (36, 38));
-    assert_eq!((offset_of!(ScanHead, collapsed), offset_of!(ScanHead, family)), (40, 42));
+    assert_eq!((offset_of!(ScanHead, collisions), offset_of!(ScanHead, family)), (40, 42));
     assert_eq!((offset_of!(ScanHead, flags), offset_of!(ScanHead, contents)), (43, 44));
     assert_eq!((offset_of!(ScanHead, intensity_bits), offset_of!(ScanHead, turns)), (45, 46));
     assert_eq!((offset_of!(ScanHead, reserved), offset_of!(ScanHead, turn_ns)), (47, 48));
@@ -403,7 +403,7 @@ fn the_bytes_of_a_scan_of_a_turn() {
         valid_to: 0xFFEF,
         no_return: Code::NoReturn.value(),
         beyond: Code::Beyond.value(),
-        collapsed: 0x0506,
+        collisions: 0x0506,
         family: Family::Ld as u8,
         flags: Scan::INCOMPLETE,
         contents: Contents::ANGLES | Contents::WIDE,
@@ -551,7 +551,7 @@ fn motion_layout() {
     );
     assert_eq!((offset_of!(Motion, covariance), offset_of!(Motion, overlap)), (36, 72));
     assert_eq!(
-        (offset_of!(Motion, method), offset_of!(Motion, flags), offset_of!(Motion, breaks)),
+        (offset_of!(Motion, method), offset_of!(Motion, flags), offset_of!(Motion, refused_steps)),
         (76, 77, 78)
     );
     assert_eq!((offset_of!(Motion, pose_covariance), offset_of!(Motion, reserved)), (80, 116));
@@ -572,7 +572,7 @@ fn motion_bytes() {
         overlap: 0.75,
         method: MotionMethod::Both as u8,
         flags: Motion::DEGENERATE,
-        breaks: 0x0102,
+        refused_steps: 0x0102,
         pose_covariance: std::array::from_fn(|i| -((i + 1) as f32) / 32.0),
         reserved: 0,
     };
@@ -631,7 +631,7 @@ fn cloud_bytes() {
     let head = CloudHead {
         sweep: 0x0102_0304,
         generation: 0x0506_0708,
-        flags: Cloud::FIRST | Cloud::LAST | Cloud::COMPLETE | Cloud::DOUBTED,
+        flags: Cloud::FIRST | Cloud::LAST | Cloud::COMPLETE | Cloud::UNRELIABLE,
         ..CloudHead::default()
     };
     let point_class = PointClass::Behind as u8;
@@ -647,7 +647,7 @@ fn cloud_bytes() {
 fn obstacles_layout() {
     assert_eq!((size_of::<Obstacles>(), align_of::<Obstacles>(), OBSTACLES), (3088, 4, 64));
     assert_eq!((offset_of!(Obstacles, sweep), offset_of!(Obstacles, generation)), (0, 4));
-    assert_eq!((offset_of!(Obstacles, left_out), offset_of!(Obstacles, count)), (8, 12));
+    assert_eq!((offset_of!(Obstacles, dropped), offset_of!(Obstacles, count)), (8, 12));
     assert_eq!((offset_of!(Obstacles, flags), offset_of!(Obstacles, reserved)), (13, 14));
     assert_eq!(offset_of!(Obstacles, obstacle_array), 16);
     assert_eq!((size_of::<Obstacle>(), align_of::<Obstacle>()), (48, 4));
@@ -662,9 +662,9 @@ fn obstacles_bytes() {
     let mut found = Obstacles {
         sweep: 0x0102_0304,
         generation: 0x0506_0708,
-        left_out: 0x090A_0B0C,
+        dropped: 0x090A_0B0C,
         count: 63,
-        flags: Obstacles::COMPLETE | Obstacles::DOUBTED,
+        flags: Obstacles::COMPLETE | Obstacles::UNRELIABLE,
         ..Obstacles::default()
     };
     found.push(Obstacle {

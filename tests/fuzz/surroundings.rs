@@ -98,16 +98,16 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
     match motion.how() {
         MotionMethod::First => assert_eq!(*motion, Motion::default()),
         MotionMethod::Refused => {
-            let breaks = before.breaks.saturating_add(1);
+            let refused_steps = before.refused_steps.saturating_add(1);
             let method = MotionMethod::Refused as u8;
-            assert_eq!(*motion, Motion { method, breaks, ..Motion::default() });
+            assert_eq!(*motion, Motion { method, refused_steps, ..Motion::default() });
         }
         _ => {
             let [x, y, yaw] = step.map(f64::from);
             assert!(x.hypot(y) <= settings.max_step_m + 1e-6, "{motion:?}");
             assert!(yaw.abs() <= settings.max_turn_deg.to_radians() + 1e-6, "{motion:?}");
             assert!(motion.overlap >= settings.min_overlap as f32 && motion.overlap <= 1.0, "{motion:?}");
-            assert_eq!(motion.breaks, before.breaks);
+            assert_eq!(motion.refused_steps, before.refused_steps);
             let of = |row: usize, column: usize| f64::from(motion.covariance[3 * row + column]);
             for (row, column) in [(0, 1), (0, 2), (1, 2)] {
                 let most = (of(row, row) * of(column, column)).sqrt();

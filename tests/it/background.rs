@@ -30,7 +30,7 @@ fn told(env: &TestEnv, order: &[&str]) -> Value {
 
 /// The model once most of its beams are known, held as it is.
 fn learned(env: &TestEnv) -> Value {
-    testkit::until("the background is learned", || number(&told(env, &["show"]), "taught") > 300);
+    testkit::until("the background is learned", || number(&told(env, &["show"]), "known_beams") > 300);
     told(env, &["freeze"]);
     told(env, &["show"])
 }
@@ -61,7 +61,7 @@ fn what_was_saved_comes_back() {
     told(&env, &["reset"]);
     let empty = told(&env, &["show"]);
     assert_eq!(
-        (number(&empty, "taught"), number(&empty, "generation")),
+        (number(&empty, "known_beams"), number(&empty, "generation")),
         (0, number(&model, "generation") + 1)
     );
     let loaded = told(&env, &["load", &file]);
@@ -91,7 +91,7 @@ fn what_was_saved_comes_back() {
     scans.await_lines(5, "a scan", |line| line["class"] == "scan");
     let after = told(&env, &["show"]);
     assert_eq!(after["generation"], begun["generation"]);
-    assert!(number(&after, "taught") >= number(&begun, "taught"), "{after}");
+    assert!(number(&after, "known_beams") >= number(&begun, "known_beams"), "{after}");
 }
 
 #[test]

@@ -92,7 +92,7 @@ fn what_the_header_computes_is_what_schema_computes() {
         succeeded(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler"));
         let said = succeeded(&output(Command::new(env.path("computes"))).expect("it runs"));
         let mut lines = said.lines();
-        let head = format!("{} {} {}", scan.beams(), scan.collapsed, u8::from(scan.is_incomplete()));
+        let head = format!("{} {} {}", scan.beams(), scan.collisions, u8::from(scan.is_incomplete()));
         assert_eq!(lines.next(), Some(head.as_str()));
         for (i, line) in lines.enumerate() {
             let mut words = line.split(' ');

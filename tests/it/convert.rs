@@ -79,17 +79,14 @@ fn reports_what_it_leaves_out_of_a_log() {
     let outcome = env.run(&["convert", &log, &env.word("a.mcap"), "--json"]);
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     let dropped = json!({"poses": 2, "odometry": 1, "remissions": 0, "lines": 1});
-    assert_eq!(
-        (&line["log_dropped"], &line["marks"], &line["left_out"]),
-        (&dropped, &json!(null), &json!(0))
-    );
+    assert_eq!((&line["log_dropped"], &line["marks"], &line["dropped"]), (&dropped, &json!(null), &json!(0)));
     let outcome = env.run(&["convert", &log, &env.word("a.bin")]);
     let says = "; dropped from the log: 2 poses, 1 line of odometry, 1 other line";
     assert!(outcome.errors.contains(says), "{outcome}");
     let outcome = env.run(&["convert", &env.word("a.mcap"), &env.word("b.log"), "--json"]);
     let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!(
-        (&line["log_dropped"], &line["left_out"], &line["scans"]),
+        (&line["log_dropped"], &line["dropped"], &line["scans"]),
         (&json!(null), &json!(0), &json!(2))
     );
     let back = std::fs::read_to_string(env.path("b.log")).expect("a log");

@@ -104,7 +104,7 @@ fn beams_are_as_many_as_are_asked_for() {
     let _hub = hub(&env, &["model=ld19", "beams=300"]);
     for scan in env.echo(&["front/scan"]).await_lines(5, "a scan", is_class("scan")) {
         check_scan(&scan, 300);
-        assert!(number(&scan, "collapsed") > 0, "450 points in 300 beams: {scan}");
+        assert!(number(&scan, "collisions") > 0, "450 points in 300 beams: {scan}");
     }
 }
 
@@ -178,7 +178,7 @@ fn probe_hears_what_it_is_and_leaves_no_trace() {
         let of = |key: &str| found[key].as_f64().unwrap_or_else(|| panic!("no {key}: {found}"));
         assert!((of("points_per_second") / points - 1.0).abs() < 0.02, "{found}");
         assert!((of("turns_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
-        assert!(number(found, "packets") > 20 && found["trouble"].is_null(), "{found}");
+        assert!(number(found, "packets") > 20 && found["problem"].is_null(), "{found}");
         assert_eq!(outcome.errors, "", "no progress without a terminal");
         let text = env.search(&["probe", &env.word(name)]).to_string();
         for word in ["family", "ld", model, "Bd", "turns"] {

@@ -34,8 +34,8 @@ fn shown(env: &TestEnv) -> Value {
     line.clone()
 }
 
-fn taught(env: &TestEnv) -> u64 {
-    number(&shown(env), "taught")
+fn known_beams(env: &TestEnv) -> u64 {
+    number(&shown(env), "known_beams")
 }
 
 /// A hub that has seen scans, and what it ended with.
@@ -53,7 +53,7 @@ fn look(env: &TestEnv, flags: &[&str], look: impl FnOnce()) -> Outcome {
 
 /// The room as a first hub has learned and kept it.
 fn learn(env: &TestEnv) {
-    look(env, &[SOON], || testkit::until("the room is learned", || taught(env) > 350));
+    look(env, &[SOON], || testkit::until("the room is learned", || known_beams(env) > 350));
     assert!(file(env).exists());
 }
 
@@ -65,7 +65,7 @@ fn who_comes_while_the_hub_is_away_is_foreground_at_once() {
         let hub = env.hub(&[&env.link("front"), SOON]);
         testkit::until("the room is learned and kept", || {
             let shown = shown(&env);
-            number(&shown, "taught") > 350 && shown["kept_wall_ns"].is_u64()
+            number(&shown, "known_beams") > 350 && shown["kept_wall_ns"].is_u64()
         });
         assert_eq!(fs::metadata(file(&env)).expect("kept").permissions().mode() & 0o777, 0o600);
         hub.end(how);
@@ -96,7 +96,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
     let kept = fs::read(file(&env)).expect("kept");
     let empty = |flags: &[&str], why: &str| {
         let flags = [&[LATE], flags].concat();
-        let outcome = look(&env, &flags, || assert_eq!(taught(&env), 0, "{flags:?}"));
+        let outcome = look(&env, &flags, || assert_eq!(known_beams(&env), 0, "{flags:?}"));
         assert!(outcome.errors.contains(why), "{outcome}\n{}", outcome.errors);
         assert_eq!(fs::read(file(&env)).expect("still there"), kept, "{flags:?}");
     };
@@ -113,11 +113,11 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
     for (wrong, why) in [
         (text[..text.len() / 2].to_owned(), "cut short"),
         (text.replacen("\"front\"", "\"rear\"", 1), "is the background of rear"),
-        (text.replacen("\"taught\":", "\"taught\":9", 1), "is no background model"),
+        (text.replacen("\"known_beams\":", "\"known_beams\":9", 1), "is no background model"),
         ("\u{0}\u{1}".to_owned(), "is no background model"),
     ] {
         fs::write(file(&env), &wrong).expect("written");
-        let outcome = look(&env, &[LATE], || assert_eq!(taught(&env), 0, "{why}"));
+        let outcome = look(&env, &[LATE], || assert_eq!(known_beams(&env), 0, "{why}"));
         assert!(outcome.errors.contains(why), "{why}: {}", outcome.errors);
     }
     fs::write(file(&env), &kept).expect("written");
@@ -125,7 +125,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
     empty(&[], "others can write it");
     // As it was it is taken.
     fs::set_permissions(file(&env), fs::Permissions::from_mode(0o600)).expect("set");
-    look(&env, &[LATE], || assert!(taught(&env) > 350));
+    look(&env, &[LATE], || assert!(known_beams(&env) > 350));
     // What was forgotten on purpose does not come back.
     for (flags, content) in [
         (vec![LATE], &kept[..]),
@@ -145,7 +145,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
 fn where_nothing_is_kept_nothing_is_written() {
     let env = TestEnv::new();
     let simulator = simulator(&env, ROOM);
-    let is_known = || testkit::until("it is learned", || taught(&env) > 350);
+    let is_known = || testkit::until("it is learned", || known_beams(&env) > 350);
     look(&env, &[SOON, "--set=background.keep=false"], || {
         is_known();
         assert!(shown(&env)["kept_wall_ns"].is_null());
@@ -162,7 +162,7 @@ fn where_nothing_is_kept_nothing_is_written() {
         .collect();
     let log = env.file("log", log);
     let is_played = |hub: Program, words: &str| {
-        testkit::until("it is learned", || taught(&env) == 181);
+        testkit::until("it is learned", || known_beams(&env) == 181);
         assert!(shown(&env)["kept_wall_ns"].is_null(), "{words}");
         hub.end(TERM);
         assert!(!file(&env).exists(), "{words}");

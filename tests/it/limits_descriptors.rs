@@ -132,7 +132,7 @@ fn a_listener_that_runs_out_of_them_listens_on() {
         let maximum = getrlimit(Resource::Nofile).maximum;
         let none = Rlimit { current: Some(0), maximum };
         let usual = prlimit(pid, Resource::Nofile, none).expect("it may have fewer");
-        let told = listener.await_line("what is wrong", |line| line["kind"] == "trouble");
+        let told = listener.await_line("what is wrong", |line| line["kind"] == "problem");
         assert!(told["message"].to_string().contains("cannot list network interfaces"), "{told}");
         prlimit(pid, Resource::Nofile, usual).expect("as before");
         let outcome = listener.end(TERM);

@@ -390,7 +390,7 @@ fn two_gateways_with_one_number_are_told_once() {
             // As far apart as they send: what comes in one moment is no second gateway.
             let_pass(Duration::from_millis(50));
         }
-        let line = program.await_line("the remedy", |line| line["kind"] == "trouble");
+        let line = program.await_line("the remedy", |line| line["kind"] == "problem");
         let message = line["message"].as_str().unwrap_or_default();
         assert!(message.contains(&format!("{HUB:016x}")) && message.contains("gateway-*"), "{line}");
         let outcome = program.end(INT);

@@ -19,7 +19,7 @@ fn said(line: &Value) -> Vec<Value> {
         "codes",
         "intensities",
         "angles_deg",
-        "collapsed",
+        "collisions",
     ];
     keys.map(|key| line[key].clone()).into()
 }

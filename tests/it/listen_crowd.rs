@@ -72,7 +72,7 @@ fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
             let hub = json!("5f3a12bc00d1e2f3");
             program.await_line("the true one", |line| line["hub"] == hub && line["class"] == "zones");
             // It may come before the true one is heard, or after.
-            let is_told = |line: &Value| line["kind"] == "trouble";
+            let is_told = |line: &Value| line["kind"] == "problem";
             if !program.has_said(is_told) {
                 program.await_line("that there was no room", is_told);
             }

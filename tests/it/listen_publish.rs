@@ -349,7 +349,7 @@ fn what_has_no_room_is_counted_as_such() {
         let few = Rlimit { current: Some(used + 4), maximum: getrlimit(Resource::Nofile).maximum };
         prlimit(Pid::from_raw(pid as i32), Resource::Nofile, few).expect("it may have fewer");
         front.announce(&[Topic::Zones, Topic::Scan]);
-        let line = program.await_line("a shortage", |line| line["kind"] == "trouble");
+        let line = program.await_line("a shortage", |line| line["kind"] == "problem");
         assert!(line["message"].to_string().contains("descriptors"), "{line}");
         front.send(Topic::Scan, &*Box::<Scan>::default());
         front.send(Topic::Marks, &Marks::default());
@@ -381,7 +381,7 @@ fn there_is_room_for_sixteen_sensors() {
             }
             let_pass(Duration::from_millis(wait_ms));
         }
-        let line = program.await_line("one too many", |line| line["kind"] == "trouble");
+        let line = program.await_line("one too many", |line| line["kind"] == "problem");
         assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");
         let listed = env.run(&["list", "--json"]).of_class("topic");
         assert_eq!(listed.len(), 16);

@@ -31,7 +31,7 @@ fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
         assert!(["beams", "points", "lines", "both"].contains(&line["method"].as_str().unwrap()), "{line}");
     }
     rear.await_lines(20, "a foreground", is_class("foreground"));
-    let known = |line: &Value| line["class"] == "background" && number(line, "taught") > 0;
+    let known = |line: &Value| line["class"] == "background" && number(line, "known_beams") > 0;
     rear.await_line("what stands", known);
     let refused = env.run(&["background", "rear", "load", "none.json"]);
     assert_ne!(refused.code, Some(0), "{refused}");

@@ -131,8 +131,8 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
-    assert!(number(&first, "taught") == 0 || number(&first, "topic_seq") > 0, "{first}");
-    until("it is learned", || number(&model(&env), "taught") > 300);
+    assert!(number(&first, "known_beams") == 0 || number(&first, "topic_seq") > 0, "{first}");
+    until("it is learned", || number(&model(&env), "known_beams") > 300);
     let file = env.word("model.json");
     taken(&env, &["save", &file]);
     let saved: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
@@ -141,11 +141,11 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
     assert_eq!(model(&env)["frozen"], true);
     taken(&env, &["reset"]);
     let second = generations.await_line("the second generation", |line| line["generation"] == 1);
-    assert_eq!((number(&second, "generation"), number(&second, "taught")), (1, 0), "{second}");
+    assert_eq!((number(&second, "generation"), number(&second, "known_beams")), (1, 0), "{second}");
     // Frozen, it learns nothing however many scans come.
     let scans = env.run(&["echo", "--json", "front/foreground", "-n", "60"]);
     assert!(scans.of_class("foreground").iter().all(|line| number(line, "generation") == 1), "{scans}");
-    assert_eq!(number(&model(&env), "taught"), 0);
+    assert_eq!(number(&model(&env), "known_beams"), 0);
     taken(&env, &["load", &file]);
     let third = generations.await_line("the third generation", |line| line["generation"] == 2);
     assert_eq!(
@@ -174,7 +174,7 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
             other["step_deg"] = 1.0.into();
             other["ranges"] = vec![Value::from(1000); 181].into();
             other["far"] = Vec::<Value>::new().into();
-            other["taught"] = 181.into();
+            other["known_beams"] = 181.into();
         }
         let refused = background(&env, &["load", &env.file("other.json", other.to_string())]);
         let error = &refused.of_class("error")[0];

@@ -55,7 +55,7 @@ fn what_was_sent_is_in_the_file_once() {
     assert_eq!(topics, wanted.iter().flatten().map(String::as_str).collect());
     assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
     assert_eq!(number(&end, "bytes"), std::fs::metadata(&file).unwrap().len());
-    assert_eq!(number(&end, "left_out"), 0);
+    assert_eq!(number(&end, "dropped"), 0);
     assert!(recording.kept.iter().all(|kept| kept.encoding == "scanhub.v2"));
     for line in outcome.of_class("summary") {
         let topic = format!("{}/{}", line["sensor"].as_str().unwrap(), line["topic"].as_str().unwrap());

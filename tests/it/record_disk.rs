@@ -236,14 +236,14 @@ fn what_cannot_be_held_is_left_out_and_said() {
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
     let recording = Recording::read(&read.join().unwrap().unwrap(), &pipe);
-    assert!(number(&gap, "left_out") > 0 && number(&end, "left_out") >= number(&gap, "left_out"), "{end}");
+    assert!(number(&gap, "dropped") > 0 && number(&end, "dropped") >= number(&gap, "dropped"), "{end}");
     assert_eq!(number(&end, "samples"), recording.kept.len() as u64);
-    let left_out = |gap: &&BTreeMap<String, String>| -> u64 {
+    let dropped = |gap: &&BTreeMap<String, String>| -> u64 {
         let counts = gap.iter().filter(|(key, _)| key.contains('/'));
         counts.map(|(_, count)| count.parse::<u64>().unwrap()).sum()
     };
-    let told: u64 = recording.notes("scanhub.gap").iter().map(left_out).sum();
-    assert_eq!(told, number(&end, "left_out"));
+    let told: u64 = recording.notes("scanhub.gap").iter().map(dropped).sum();
+    assert_eq!(told, number(&end, "dropped"));
 }
 
 #[test]

@@ -82,7 +82,7 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
             |scan: &Scan| (0..scan.beams()).map(|beam| scan.angle(beam).to_bits()).collect::<Vec<_>>();
         assert_eq!(exact(&then), exact(&now), "{}", header.seq);
         assert_eq!(then.intensities(), now.intensities());
-        assert_eq!((then.flags, then.collapsed, then.family), (now.flags, now.collapsed, now.family));
+        assert_eq!((then.flags, then.collisions, then.family), (now.flags, now.collisions, now.family));
         let line_error = Reasons::LINE_ERROR;
         assert_eq!(header.reasons & !line_error, played.reasons & !line_error, "{}", header.seq);
         assert_eq!(played.flags & Flags::REPLAYED, Flags::REPLAYED);

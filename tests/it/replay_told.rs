@@ -32,7 +32,7 @@ fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
         let found = rest.iter().position(|(_, payload)| scan(payload).ranges() == then.ranges());
         let Some(at) = found else { continue };
         let now = scan(&rest[at].1);
-        assert_eq!((then.flags, then.collapsed), (now.flags, now.collapsed), "{}", header.seq);
+        assert_eq!((then.flags, then.collisions), (now.flags, now.collisions), "{}", header.seq);
         rest = &rest[at + 1..];
         compared += 1;
     }

@@ -114,7 +114,7 @@ fn probe_asks_what_it_is_and_listens_to_its_line() {
         assert_eq!(simulator.end(TERM).code, Some(0));
         assert_eq!(env.simulated("front").1, 0);
         assert!(number(found, "packets") > 20 && found["damaged"].as_f64() == Some(0.0), "{found}");
-        assert!(found["trouble"].is_null(), "{found}");
+        assert!(found["problem"].is_null(), "{found}");
         let sent = env.truth("front");
         assert!(sent[..2].iter().all(|sent| sent.is_reply), "first what it is, and how");
     }
@@ -207,7 +207,7 @@ fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
     let probed = env.search(&["probe", &port, "--json"]);
     let [found] = &probed.lines()[..] else { panic!("{probed}") };
     assert!(found["damaged"].as_f64().is_some_and(|share| share > 0.4), "{found}");
-    assert!(text(found, "trouble").contains("of the bytes are damaged on the line"), "{found}");
+    assert!(text(found, "problem").contains("of the bytes are damaged on the line"), "{found}");
 
     let outcome = env.run(&["doctor", &port, "--json", "--no-system-config"]);
     assert_eq!(outcome.code, Some(5), "{outcome}");

@@ -192,8 +192,9 @@ fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacl
         assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1, "{obstacles}");
         let sum = &found.of_class("summary")[0];
         // On a busy machine, `tilt` may miss angles.
-        let unfit = ["angles_unordered", "angles_ahead", "angles_unfit"].map(|key| number(sum, key));
-        assert_eq!(unfit, [0; 3], "{sum}");
+        let invalid =
+            ["angles_out_of_order", "angles_in_future", "angles_invalid"].map(|key| number(sum, key));
+        assert_eq!(invalid, [0; 3], "{sum}");
     }
     ends_well(hall);
 }
@@ -243,8 +244,9 @@ fn a_recording_has_three_dimensions() {
     // Four whole sweeps are enough to notice stamps that are 8 ms off.
     assert!(number(sum, "sweeps") >= 4 && sum["late_ms"] == 0.0, "{sum}");
     assert!(number(sum, "points") > 50_000, "{sum}");
-    let withheld = ["jumped", "inconsistent", "standing"].map(|why| number(&sum["withheld"], why));
-    assert_eq!(withheld, [0; 3], "{sum}");
+    let points_dropped =
+        ["jumped", "inconsistent", "standing"].map(|why| number(&sum["points_dropped"], why));
+    assert_eq!(points_dropped, [0; 3], "{sum}");
 }
 
 #[test]
@@ -293,7 +295,7 @@ fn stamps_of_angles_that_are_late_are_reported() {
     let is_late = |line: &Value| is_class("angles")(line) && line["late_ms"] != 0.0;
     let late = tilt.await_line("the delay", is_late);
     let late_ms = late["late_ms"].as_f64().expect("a number");
-    assert!((98.0..102.0).contains(&late_ms) && late["trouble"].is_null(), "{late}");
+    assert!((98.0..102.0).contains(&late_ms) && late["problem"].is_null(), "{late}");
     let outcome = tilt.end(INT);
     assert!(outcome.of_class("summary")[0]["late_ms"].as_f64().expect("a number") > 98.0, "{outcome}");
     assert_eq!(player.end(INT).code, Some(0));
@@ -307,11 +309,11 @@ fn angles_that_stop_are_told_and_a_name_that_is_not_there_too() {
     // Whoever says how the mount stands goes away with the simulator; the hub's scans go on from another one.
     drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
     hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
-    let said = tilt.await_line("no angles", |line| is_class("angles")(line) && line["trouble"] == "silent");
+    let said = tilt.await_line("no angles", |line| is_class("angles")(line) && line["problem"] == "silent");
     assert_eq!(said["sensor"], "tilted", "it publishes nothing");
     let outcome = tilt.end(INT);
     let sum = &outcome.of_class("summary")[0];
-    assert!(outcome.code == Some(0) && number(&sum["withheld"], "silent") > 0, "{outcome}");
+    assert!(outcome.code == Some(0) && number(&sum["points_dropped"], "silent") > 0, "{outcome}");
     let none = hall.env.run(&["tilt", "front", "--angles=none", "--axis-at=0,0,1", "--timeout=2s"]);
     assert!(none.code == Some(3) && none.errors.contains("none"), "{none}");
     let wrong = hall.env.run(&["tilt", "front", "--angles=mount", "--axis-at=0,0"]);

@@ -209,7 +209,7 @@ fn another_machine_says_the_same() {
         for other in [&lines, &again] {
             assert!(same(&echo, other, "cloud", &keys) >= 2);
             assert!(same(&echo, other, "tilt", &["angle_deg", "rate_deg_s"]) >= 1);
-            assert!(same(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "left_out"]) >= 1);
+            assert!(same(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "dropped"]) >= 1);
         }
         assert!(lines.of_class("cloud").iter().all(|line| line["sensor"] == "room"));
     });

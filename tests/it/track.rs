@@ -113,7 +113,7 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
     }
     let outcome = track.end(INT);
     let summary = &outcome.of_class("summary")[0];
-    assert_eq!((number(summary, "appeared"), number(summary, "unfit")), (1, 0), "{summary}");
+    assert_eq!((number(summary, "appeared"), number(summary, "invalid")), (1, 0), "{summary}");
     assert!(number(summary, "scans") > 500, "{summary}");
     assert_eq!(summary["doors"][0]["forth"], 1);
     assert!(counts.end(INT).of_class("tracks").is_empty(), "counts alone");

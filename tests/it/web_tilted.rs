@@ -77,7 +77,7 @@ fn are_obstacles(update: &Value, line: &Value) -> bool {
     };
     metadata(&entities[0], "sweep") == line["sweep"]
         && metadata(&entities[0], "complete") == line["complete"]
-        && metadata(&entities[0], "doubted") == line["doubted"]
+        && metadata(&entities[0], "unreliable") == line["unreliable"]
         && entities.len() == said.len() + 1
         && entities[1..].iter().zip(said).all(is_box)
 }

@@ -222,7 +222,7 @@ impl Receiving<'_> {
                 self.asked.iter().try_for_each(|&topic| (self.ask)(&Address { hub, sensor: &sensor, topic }));
             if let Err(failure) = asked {
                 self.asking.unasked += 1;
-                self.reception.trouble(&failure.to_string())?;
+                self.reception.problem(&failure.to_string())?;
             }
         }
         Ok(())

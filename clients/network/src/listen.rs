@@ -213,7 +213,7 @@ impl Listener<'_> {
     fn do_periodic_work(&mut self, now: Instant, may_have_more: bool) -> Result<(), End> {
         self.receiver.update_interfaces(now);
         if let Some(what) = self.receiver.take_problem() {
-            self.reception.trouble(&what)?;
+            self.reception.problem(&what)?;
         }
         self.reception.look(now, may_have_more)?;
         if self.is_drawn && now >= self.draw_at {

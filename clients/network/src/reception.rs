@@ -167,7 +167,7 @@ impl<'a> Reception<'a> {
     ///
     /// Returns the reason why output cannot be written.
     pub fn begin(&mut self) -> Result<(), End> {
-        self.unreadable.take().map_or(Ok(()), |failure| self.trouble(&failure.to_string()))
+        self.unreadable.take().map_or(Ok(()), |failure| self.problem(&failure.to_string()))
     }
 
     /// Handles `bytes`, a whole datagram. Call [`wake`](Reception::wake) when no more are waiting.
@@ -186,7 +186,7 @@ impl<'a> Reception<'a> {
         // An epoch is new once in a run of a gateway.
         match (self.incoming.take_epochs(), &self.epochs) {
             (Some(known), Some(epochs)) => {
-                epochs.keep(&known).or_else(|failure| self.trouble(&failure.to_string()))
+                epochs.keep(&known).or_else(|failure| self.problem(&failure.to_string()))
             }
             _ => Ok(()),
         }
@@ -216,7 +216,7 @@ impl<'a> Reception<'a> {
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),
         };
-        self.capacity.check(so_far, now).map_or(Ok(()), |what| self.report.trouble(&what))
+        self.capacity.check(so_far, now).map_or(Ok(()), |what| self.report.problem(&what))
     }
 
     /// Prints the counters. `others` are reasons for which datagrams were refused before they reached this receiver.
@@ -240,12 +240,12 @@ impl<'a> Reception<'a> {
     /// # Errors
     ///
     /// Returns the reason why output cannot be written.
-    pub fn trouble(&mut self, what: &str) -> Result<(), End> {
+    pub fn problem(&mut self, what: &str) -> Result<(), End> {
         if self.reported.len() == MAX_REPORTED || self.reported.iter().any(|reported| reported == what) {
             return Ok(());
         }
         self.reported.push(what.to_owned());
-        self.report.trouble(what)
+        self.report.problem(what)
     }
 
     /// Handles the result of receiving a datagram.
@@ -265,12 +265,12 @@ impl<'a> Reception<'a> {
             }
             Arrived::Refused { shared: Some(hub), .. } => {
                 let what = duplicate_gateways(&self.report.names.of(hub));
-                self.trouble(&what)
+                self.problem(&what)
             }
-            Arrived::Refused { why: DatagramError::Version, .. } => self.trouble(OTHER_VERSION),
-            Arrived::Refused { why: DatagramError::Skipped, .. } => self.trouble(NEWER_TOPIC),
+            Arrived::Refused { why: DatagramError::Version, .. } => self.problem(OTHER_VERSION),
+            Arrived::Refused { why: DatagramError::Skipped, .. } => self.problem(NEWER_TOPIC),
             Arrived::Untimely { behind_ns } => {
-                self.trouble(if behind_ns < 0 { CLOCK_AHEAD } else { CLOCK_BEHIND })
+                self.problem(if behind_ns < 0 { CLOCK_AHEAD } else { CLOCK_BEHIND })
             }
             Arrived::Foreign => {
                 self.foreign += 1;
@@ -294,7 +294,7 @@ impl<'a> Reception<'a> {
             let made = publication.sample(sample, || self.report.names.of(head.hub), now());
             if publication.left_out.no_room > no_room {
                 self.incoming.count_no_room(head.hub);
-                self.trouble(NO_ROOM)?;
+                self.problem(NO_ROOM)?;
             }
             return self.report_publication(head, made, from);
         }
@@ -332,7 +332,7 @@ impl<'a> Reception<'a> {
         match made {
             Ok(Some(name)) => self.report.published(head, &name, from.is_some_and(is_of_this_machine)),
             Ok(None) => Ok(()),
-            Err(failure) => self.trouble(&failure.to_string()),
+            Err(failure) => self.problem(&failure.to_string()),
         }
     }
 }

@@ -18,7 +18,7 @@ use scanhub_schema::Scan;
 pub use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
 use serde::{Serialize, Serializer};
 
-pub use self::angles::{Angle, Withheld};
+pub use self::angles::{Angle, DropReason};
 use self::angles::{AngleLookup, AngleUpdate, Angles, ReversalDetector, SwingEvent};
 use self::delay::{Delay, MOST_S};
 pub use self::mount::{Check, Floor, Mount, Wall};
@@ -43,30 +43,30 @@ pub struct Counts {
     /// Returned sweeps that are not complete.
     pub incomplete: u64,
     /// Returned sweeps that contradict the background.
-    pub doubted: u64,
+    pub unreliable: u64,
     /// Resets of the background, because scans changed or sweeps contradicted it for too long.
-    pub forgotten: u64,
+    pub background_resets: u64,
     /// Scans that were taken.
     pub scans: u64,
     /// Scans that were dropped because later ones had arrived.
-    pub unordered: u64,
+    pub out_of_order: u64,
     /// Points that were made.
     pub points: u64,
-    /// Beams with a reading that made no point, by [`Withheld`].
+    /// Beams with a reading that made no point, by [`DropReason`].
     #[serde(serialize_with = "by_reason")]
-    pub withheld: [u64; Withheld::COUNT],
+    pub points_dropped: [u64; DropReason::COUNT],
     /// Angles that were taken.
     pub angles: u64,
     /// Angles that were dropped because later ones had arrived.
-    pub angles_unordered: u64,
+    pub angles_out_of_order: u64,
     /// Angles that were dropped because their stamps are later than all scans.
-    pub angles_ahead: u64,
+    pub angles_in_future: u64,
     /// Angles that were dropped because they are not numbers.
-    pub angles_unfit: u64,
+    pub angles_invalid: u64,
 }
 
-fn by_reason<S: Serializer>(counts: &[u64; Withheld::COUNT], serializer: S) -> Result<S::Ok, S::Error> {
-    use Withheld::{Inconsistent, Jumped, Silent, Standing};
+fn by_reason<S: Serializer>(counts: &[u64; DropReason::COUNT], serializer: S) -> Result<S::Ok, S::Error> {
+    use DropReason::{Inconsistent, Jumped, Silent, Standing};
     serializer.collect_map([Silent, Jumped, Inconsistent, Standing].into_iter().zip(counts))
 }
 
@@ -134,7 +134,7 @@ impl TiltScanner {
 
     /// Returns the counters.
     pub fn counts(&self) -> Counts {
-        Counts { forgotten: self.analyzer.forgotten, ..self.counts }
+        Counts { background_resets: self.analyzer.background_resets, ..self.counts }
     }
 
     /// Returns the estimated delay of the stamps of the mount in ns, by which all angles are corrected. It follows
@@ -144,10 +144,10 @@ impl TiltScanner {
     }
 
     /// Returns the reason why beams that are measured now make no points. `None` if they do.
-    pub fn trouble(&self) -> Option<Withheld> {
+    pub fn problem(&self) -> Option<DropReason> {
         let late_ns = self.scan_ns.unwrap_or(0).saturating_sub(self.settings.delay_ns);
         let is_silent = self.angles.last_ns().is_none_or(|last_ns| last_ns < late_ns);
-        if is_silent { Some(Withheld::Silent) } else { self.angles.trouble() }
+        if is_silent { Some(DropReason::Silent) } else { self.angles.problem() }
     }
 
     /// Takes the next angle, and passes each complete sweep to `show`.
@@ -157,7 +157,7 @@ impl TiltScanner {
             AngleUpdate::Dropped => return,
             AngleUpdate::Torn => {
                 self.reversals.forget();
-                if self.angles.trouble() == Some(Withheld::Jumped) {
+                if self.angles.problem() == Some(DropReason::Jumped) {
                     self.analyzer.distrust();
                 }
                 self.interrupt_sweep(before_ns.unwrap_or(self.angles.true_ns(angle.stamp_ns)));
@@ -172,7 +172,8 @@ impl TiltScanner {
                     let since_ns = self.angles.true_ns(stamp_ns);
                     let before = self.rays.len();
                     self.rays.retain(|ray| ray.time_ns <= since_ns);
-                    self.counts.withheld[Withheld::Standing as usize] += (before - self.rays.len()) as u64;
+                    self.counts.points_dropped[DropReason::Standing as usize] +=
+                        (before - self.rays.len()) as u64;
                     self.interrupt_sweep(since_ns);
                 }
             },
@@ -185,7 +186,7 @@ impl TiltScanner {
     pub fn take_scan(&mut self, stamp_ns: u64, scan: &Scan, mut show: impl FnMut(&Sweep<'_>)) {
         if let Some(last_ns) = self.scan_ns.filter(|&last_ns| stamp_ns <= last_ns) {
             if last_ns - stamp_ns < JUMP_NS {
-                self.counts.unordered += 1;
+                self.counts.out_of_order += 1;
                 return;
             }
             self.reset();
@@ -265,10 +266,10 @@ impl TiltScanner {
                     continue;
                 }
                 AngleLookup::Never(why) => why,
-                AngleLookup::Open => Withheld::Silent,
+                AngleLookup::Open => DropReason::Silent,
             };
             self.is_whole = false;
-            self.counts.withheld[why as usize] += u64::from(!is_far);
+            self.counts.points_dropped[why as usize] += u64::from(!is_far);
         }
         self.counts.scans += 1;
         self.taken_ns = self.taken_ns.max(one.until_ns);
@@ -309,7 +310,7 @@ impl TiltScanner {
                 }
                 _ => false,
             });
-            counts.withheld[Withheld::Silent as usize] += (before - rays.len()) as u64;
+            counts.points_dropped[DropReason::Silent as usize] += (before - rays.len()) as u64;
             before == rays.len()
         });
         ends.iter_mut().for_each(|end| end.stamp_ns = end.stamp_ns.saturating_add_signed(-more_ns));
@@ -342,7 +343,7 @@ impl TiltScanner {
         self.counts.points += sweep.points.len() as u64;
         self.counts.sweeps += 1;
         self.counts.incomplete += u64::from(!sweep.is_complete);
-        self.counts.doubted += u64::from(sweep.is_doubted);
+        self.counts.unreliable += u64::from(sweep.is_unreliable);
         show(&sweep);
         is_next_whole
     }
@@ -374,7 +375,7 @@ pub struct Sweep<'a> {
     pub is_complete: bool,
     /// Whether its angles contradict the background, so that they are unreliable. All points then have class unknown,
     /// and there are no obstacles.
-    pub is_doubted: bool,
+    pub is_unreliable: bool,
     /// Generation of the background that the points were compared with. Each reset increases it by 1.
     pub generation: u32,
     /// Delay of the angles' stamps by which its angles are corrected, in ns.
@@ -384,7 +385,7 @@ pub struct Sweep<'a> {
     /// Obstacles, the nearest first.
     pub obstacles: &'a [Obstacle],
     /// Number of obstacles beyond the maximum.
-    pub left_out: u32,
+    pub dropped: u32,
 }
 
 /// Parameters for sweeps, background and obstacles.

@@ -50,7 +50,7 @@ pub struct Counts {
     /// Scans that were dropped because their stamp is seconds away from all others.
     pub jumped: u64,
     /// Scans that were dropped because their foreground has other beams, or because their sensor is not in the site.
-    pub unfit: u64,
+    pub invalid: u64,
 }
 
 struct Waiting {
@@ -142,7 +142,7 @@ impl PeopleTracker {
         mut show: impl FnMut(&Picture),
     ) {
         if sensor >= self.queues.len() || usize::from(foreground.count) != scan.beams() || scan.beams() == 0 {
-            self.counts.unfit += 1;
+            self.counts.invalid += 1;
             return;
         }
         let at_ns = self.corrected(sensor, wall_ns);

@@ -94,5 +94,5 @@ fn late_scans_are_notes_with_a_remedy() {
         line.starts_with("rear: ") && line.ends_with("arrived late: set --delay longer than 80ms"),
         "{line}"
     );
-    assert!(number(&out, "left out: ") > 0, "{out}");
+    assert!(number(&out, "dropped: ") > 0, "{out}");
 }

@@ -130,7 +130,7 @@ getters! {
     /// Bits of an intensity; 0 if there are none.
     intensity_bits: u8 = scan.intensity_bits;
     /// Number of points that were dropped because another point has the same beam.
-    collapsed: u16 = scan.collapsed;
+    collisions: u16 = scan.collisions;
     /// Whether packets of the revolution are missing.
     incomplete: bool = scan.is_incomplete();
     /// Ranges in meters, NaN without a reading: computed.
@@ -248,7 +248,7 @@ getters! {
     /// Whether the surroundings leave a direction open, as a corridor does.
     degenerate: bool = motion.is_degenerate();
     /// Number of refused steps since the start.
-    breaks: u16 = motion.breaks;
+    refused_steps: u16 = motion.refused_steps;
 }
 
 getters! {
@@ -311,7 +311,7 @@ getters! {
         })
     };
     /// Number of segments that did not fit.
-    left_out: u16 = foreground.left_out;
+    dropped: u16 = foreground.dropped;
 }
 
 getters! {
@@ -319,7 +319,7 @@ getters! {
     /// Number of the model. It increases by 1 after a reset, a load, and a change of the beams or the unit.
     generation: u32 = background.generation;
     /// Number of beams whose background is known.
-    taught: u16 = background.taught;
+    known_beams: u16 = background.known_beams;
     /// Number of beams; 0 before the first scan.
     count: usize = background.ranges().len();
     /// Millimeters per device unit.
@@ -331,7 +331,7 @@ getters! {
     /// Ranges in meters, NaN if unknown, infinite if beyond the maximum range: computed.
     ranges_m: Object<'py> = {
         let in_m = |range: &u16| match *range {
-            client::Background::UNTAUGHT => f64::NAN,
+            client::Background::UNKNOWN => f64::NAN,
             client::Background::FAR => f64::INFINITY,
             range => f64::from(range) * f64::from(background.unit_um) / 1e6,
         };
@@ -467,7 +467,7 @@ getters! {
     /// Whether the sweep went from one reversal to the next, and no angle was missing.
     complete: bool = cloud.has(client::Cloud::COMPLETE);
     /// Whether the angles contradict the background, so that nothing is known of obstacles.
-    doubted: bool = cloud.has(client::Cloud::DOUBTED);
+    unreliable: bool = cloud.has(client::Cloud::UNRELIABLE);
     /// Number of points.
     count: usize = cloud.points().len();
     /// Rows of x, y and z in the robot's frame, in meters: a view.
@@ -503,9 +503,9 @@ getters! {
     /// Whether the sweep went from one reversal to the next, and no angle was missing.
     complete: bool = obstacles.has(client::Obstacles::COMPLETE);
     /// Whether the angles contradict the background, so that nothing is known of obstacles.
-    doubted: bool = obstacles.has(client::Obstacles::DOUBTED);
+    unreliable: bool = obstacles.has(client::Obstacles::UNRELIABLE);
     /// Number of obstacles that did not fit.
-    left_out: u32 = obstacles.left_out;
+    dropped: u32 = obstacles.dropped;
     /// The obstacles, the nearest first.
     obstacles: List<'py> = {
         values(slf.py(), obstacles.obstacles().iter(), |obstacle| {

@@ -54,7 +54,7 @@ def scan(sample: scanhub.Scan) -> dict:
     if sample.exact_angles is not None:
         pairs = zip(sample.angles, sample.valid)
         said["angles_deg"] = [round(math.degrees(angle), 4) if valid else None for angle, valid in pairs]
-        said["collapsed"] = sample.collapsed
+        said["collisions"] = sample.collisions
     return {**said, **({"incomplete": True} if sample.incomplete else {})}
 
 
@@ -87,7 +87,7 @@ def motion(sample: scanhub.Motion) -> dict:
     def millionths(value: float | None) -> float | None:
         return None if value is None else math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
 
-    said = {name: getattr(sample, name) for name in ("method", "valid", "degenerate", "breaks")}
+    said = {name: getattr(sample, name) for name in ("method", "valid", "degenerate", "refused_steps")}
     step, place = sample.step or (None,) * 3, sample.place or (None,) * 3
     said["dx_m"], said["dy_m"], said["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
     said["x_m"], said["y_m"], said["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])
@@ -125,7 +125,7 @@ def tilt(sample: scanhub.Tilt) -> dict:
 
 
 def swept(sample: scanhub.Cloud | scanhub.Obstacles) -> dict:
-    return {name: getattr(sample, name) for name in ("sweep", "generation", "complete", "doubted")}
+    return {name: getattr(sample, name) for name in ("sweep", "generation", "complete", "unreliable")}
 
 
 def cloud(sample: scanhub.Cloud) -> dict:
@@ -141,7 +141,7 @@ def obstacles(sample: scanhub.Obstacles) -> dict:
         said.update({name: [rounded(value, 3) for value in said[name]] for name in ("low_m", "high_m")})
         return said
 
-    said = {**swept(sample), "left_out": sample.left_out}
+    said = {**swept(sample), "dropped": sample.dropped}
     return {**said, "obstacles": [obstacle(of) for of in sample.obstacles]}
 
 
@@ -153,13 +153,13 @@ def zones(sample: scanhub.Zones) -> dict:
 
 
 def foreground(sample: scanhub.Foreground) -> dict:
-    said = {name: getattr(sample, name) for name in ("generation", "unit_mm", "left_out")}
+    said = {name: getattr(sample, name) for name in ("generation", "unit_mm", "dropped")}
     said["beams"], said["ranges"] = sample.beams.tolist(), sample.ranges.tolist()
     return {**said, "segments": [segment._asdict() for segment in sample.segments]}
 
 
 def background(sample: scanhub.Background) -> dict:
-    said = {name: getattr(sample, name) for name in ("generation", "taught", "unit_mm", "count", "frozen")}
+    said = {name: getattr(sample, name) for name in ("generation", "known_beams", "unit_mm", "count", "frozen")}
     said["first_angle_deg"], said["step_deg"] = in_degrees(sample.first_angle), in_degrees(sample.step)
     said["ranges"] = [None if range in (0, 65535) else int(range) for range in sample.ranges]
     said["far"] = [beam for beam, range in enumerate(sample.ranges) if range == 65535]

@@ -26,14 +26,14 @@ def state() -> str:
 
 
 def models_are_shown_and_ordered() -> None:
-    until(lambda: ask().taught > 300)
+    until(lambda: ask().known_beams > 300)
     model = ask("freeze")
     assert model.frozen and model.count == 361 and model.sensor == "front"
     assert np.isfinite(model.ranges_m).sum() > 200 and abs(model.angles[180]) < 1e-12
     published = next(scanhub.subscribe("front/background", domain=domain, root=root, timeout=20))
     assert published.generation == model.generation and published.count == 361
     anew = ask("reset")
-    assert anew.generation == model.generation + 1 and anew.taught == 0 and anew.frozen
+    assert anew.generation == model.generation + 1 and anew.known_beams == 0 and anew.frozen
     assert not ask("thaw").frozen
 
 

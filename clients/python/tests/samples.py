@@ -30,7 +30,7 @@ def headers_say_what_they_are() -> None:
 
 def payloads_say_what_they_are() -> None:
     of = sample("scan", "scan")
-    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collapsed) == ("lms", 401, 10_000, 9250, 0)
+    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collisions) == ("lms", 401, 10_000, 9250, 0)
     assert (of.first_angle, of.step, of.incomplete) == (np.deg2rad(-50), np.deg2rad(0.25), False)
     assert (of.intensity_bits, list(of.upper[[0, 400]]), list(of.intensities[[0, 400]])) == (3, [7, 6], [7, 6])
     assert (of.ranges[0], of.ranges[400], of.ranges.shape) == (0x1234, 0x1FFF, (401,))
@@ -40,7 +40,7 @@ def payloads_say_what_they_are() -> None:
     assert (of.times_ns[400], of.times_ns[3]) == (3 - 3 * 13_320_000, 3 - 397 * 9250)
 
     of = sample("scan", "scan_turn")
-    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collapsed) == ("ld", 5, 250, 0x1020304, 0x506)
+    assert (of.family, of.count, of.unit_um, of.beam_time_ns, of.collisions) == ("ld", 5, 250, 0x1020304, 0x506)
     assert (of.first_angle, of.step, of.spacing, of.incomplete) == (-0.25, -1.5, 0.75, True)
     assert of.ranges_m[:2].tolist() == [1.165, 0xFFEF / 4000] and np.isnan(of.ranges_m[2:]).all()
     assert of.codes == [(2, "no_return"), (3, "not_measured"), (4, "beyond")]
@@ -60,7 +60,7 @@ def payloads_say_what_they_are() -> None:
     assert of.corners[63] == (1, -1, 62, 63)
 
     of = sample("motion", "motion")
-    assert (of.method, of.valid, of.degenerate, of.breaks, of.overlap) == ("both", True, True, 0x102, 0.75)
+    assert (of.method, of.valid, of.degenerate, of.refused_steps, of.overlap) == ("both", True, True, 0x102, 0.75)
     assert of.step == (0.25, -0.125, -0.0625) and of.place == (1, -2, 0.5)
     assert of.covariance.tolist() == [[1 / 64, 2 / 64, 3 / 64], [4 / 64, 5 / 64, 6 / 64], [7 / 64, 8 / 64, 9 / 64]]
 
@@ -94,14 +94,14 @@ def payloads_say_what_they_are() -> None:
 
     of = sample("cloud", "cloud")
     assert (of.sweep, of.generation, of.count) == (0x1020304, 0x5060708, 2)
-    assert of.first and of.last and of.complete and of.doubted
+    assert of.first and of.last and of.complete and of.unreliable
     assert of.points.tolist() == [[0, 0, 0], [1, -1, 0.5]] and of.points.dtype == np.float32
     assert (of.beams.tolist(), of.classes.tolist()) == ([0, 0x102], [0, 3])
     assert scanhub.CLASSES[of.classes[1]] == "behind" and not of.points.flags.writeable and not of.points.flags.owndata
 
     of = sample("obstacles", "obstacles")
-    assert (of.sweep, of.generation, of.left_out) == (0x1020304, 0x5060708, 0x90A0B0C)
-    assert (of.complete, of.doubted, len(of.obstacles)) == (True, True, 64)
+    assert (of.sweep, of.generation, of.dropped) == (0x1020304, 0x5060708, 0x90A0B0C)
+    assert (of.complete, of.unreliable, len(of.obstacles)) == (True, True, 64)
     assert of.obstacles[63] == (1, -1, 0.5, (0.5, -2, 0.25), (2, -0.5, 4), 0.5, 0xD0E0F10, True, True)
     assert of.obstacles[0] == (0, 0, 0, (0, 0, 0), (0, 0, 0), 0, 0, False, False)
 
@@ -110,13 +110,13 @@ def payloads_say_what_they_are() -> None:
     assert of.provisional and of.zones == ((0, False, 0), (600, True, 0x107))
 
     of = sample("foreground", "foreground")
-    assert (of.generation, of.count, of.unit_mm, of.left_out) == (0x10203, 401, 10, 0x104)
+    assert (of.generation, of.count, of.unit_mm, of.dropped) == (0x10203, 401, 10, 0x104)
     assert (list(of.beams), list(of.ranges), len(of.segments)) == ([400], [0x1234], 64)
     assert of.segments[63] == (400, 0x105, 60, 70, -2, 8, True)
     assert [i for i, segment in enumerate(of.segments) if segment.support] == [1, 2, 9, 63]
 
     of = sample("background", "background")
-    assert (of.generation, of.taught, of.count, of.unit_mm, of.frozen) == (0x10203, 0x104, 401, 10, True)
+    assert (of.generation, of.known_beams, of.count, of.unit_mm, of.frozen) == (0x10203, 0x104, 401, 10, True)
     assert list(of.ranges[[0, 1, 400]]) == [0x1234, 0, 0xFFFF]
     assert of.ranges_m[0] == 46.6 and np.isnan(of.ranges_m[1]) and np.isinf(of.ranges_m[400])
     assert (of.first_angle, of.step, of.angles[400]) == (-0.25, -1.5, -0.25 - 400 * 1.5)

@@ -168,7 +168,7 @@ fn save(
         let hint = format!("a scan must arrive first: `scanhub info {sensor}` shows its state");
         return Err(Failure::new(Kind::Failed, format!("{sensor} has no background model yet"), hint));
     }
-    if model.taught == 0 {
+    if model.known_beams == 0 {
         let hint = format!(
             "learning takes some seconds: `scanhub background {sensor} show`; frozen it learns nothing"
         );
@@ -186,11 +186,18 @@ fn save(
         .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
     content.push(b'\n');
     output::write(file, &content, force)?;
-    let (BackgroundHead { taught, count, generation, .. }, place) = (**model, file.display());
+    let (BackgroundHead { known_beams, count, generation, .. }, place) = (**model, file.display());
     quiet(if json {
-        printed.json(&Saved { class: "saved", sensor, file: place.to_string(), generation, taught, count })
+        printed.json(&Saved {
+            class: "saved",
+            sensor,
+            file: place.to_string(),
+            generation,
+            known_beams,
+            count,
+        })
     } else {
-        printed.line(|line| write!(line, "{sensor}: {taught} of {count} beams saved to {place}"))
+        printed.line(|line| write!(line, "{sensor}: {known_beams} of {count} beams saved to {place}"))
     })
 }
 
@@ -201,7 +208,7 @@ struct Saved<'a> {
     sensor: &'a str,
     file: String,
     generation: u32,
-    taught: u16,
+    known_beams: u16,
     count: u16,
 }
 

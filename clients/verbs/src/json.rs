@@ -133,7 +133,7 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         #[serde(serialize_with = "angles", skip_serializing_if = "has_grid_only")]
         angles_deg: &'a Scan,
         #[serde(skip_serializing_if = "Option::is_none")]
-        collapsed: Option<u16>,
+        collisions: Option<u16>,
         #[serde(skip_serializing_if = "std::ops::Not::not")]
         incomplete: bool,
         #[serde(flatten)]
@@ -152,7 +152,7 @@ pub(crate) fn scan<'a>(sensor: &'a str, header: &Header, scan: &'a Scan) -> impl
         intensities: scan.intensities(),
         angles_deg: scan,
         // What comes without exact angles was on no grid.
-        collapsed: (!has_grid_only(scan)).then_some(scan.collapsed),
+        collisions: (!has_grid_only(scan)).then_some(scan.collisions),
         incomplete: scan.is_incomplete(),
         flags: Words::of(header),
     }
@@ -421,7 +421,7 @@ mod tests {
             unit_um: 250,
             valid_to: 0xFFEF,
             no_return: Code::NoReturn.value(),
-            collapsed: 2,
+            collisions: 2,
             family: Family::Ld as u8,
             flags: Scan::INCOMPLETE,
             contents: Contents::ANGLES | Contents::WIDE,
@@ -435,10 +435,10 @@ mod tests {
         let header = Header { quality: 1, reasons: Reasons::SLOW, flags: Flags::SIMULATED, ..header() };
         let head = r#""suspect","reasons":["slow"],"family":"ld","unit_um":250,"count":4,"first_angle_deg":0.0,"step_deg":-90.0,"beam_time_ns":62500,"#;
         let measured = r#""ranges":[4001,null,null,0],"codes":[[1,"no_return"]],"intensities":[700,1,0,65535],"angles_deg":[14.3239,null,null,-272.155],"#;
-        let end = r#""collapsed":2,"incomplete":true,"flags":["simulated"]}"#;
+        let end = r#""collisions":2,"incomplete":true,"flags":["simulated"]}"#;
         assert_eq!(line(&header, &scan), [BEGIN, head, measured, end].concat());
-        (scan.collapsed, scan.flags) = (0, 0);
-        let end = r#""collapsed":0,"flags":["simulated"]}"#;
+        (scan.collisions, scan.flags) = (0, 0);
+        let end = r#""collisions":0,"flags":["simulated"]}"#;
         assert_eq!(line(&header, &scan), [BEGIN, head, measured, end].concat());
     }
 

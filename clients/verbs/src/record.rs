@@ -278,7 +278,7 @@ struct Recorder<'a> {
     /// Samples that were passed to the disk thread.
     pushed: u64,
     /// Samples that the queue had no room for.
-    left_out: u64,
+    dropped: u64,
     gap: Option<Gap>,
     tick_at: Instant,
     report: Report<'a>,
@@ -304,7 +304,7 @@ impl<'a> Recorder<'a> {
             progress,
             tracks: Vec::new(),
             pushed: 0,
-            left_out: 0,
+            dropped: 0,
             gap: None,
             tick_at: Instant::now(),
             report,
@@ -351,14 +351,13 @@ impl<'a> Recorder<'a> {
 
     /// Leaves out a sample for which there is no room, and all that follow until there is room for many.
     fn leave_out(&mut self, name: &TopicName) -> Result<(), End> {
-        self.left_out += 1;
+        self.dropped += 1;
         let is_first = self.gap.is_none();
         let now_ns = clock::wall_ns();
-        let gap =
-            self.gap.get_or_insert_with(|| Gap { from_ns: now_ns, to_ns: now_ns, left_out: Vec::new() });
-        match gap.left_out.iter_mut().find(|(other, _)| other == name) {
+        let gap = self.gap.get_or_insert_with(|| Gap { from_ns: now_ns, to_ns: now_ns, dropped: Vec::new() });
+        match gap.dropped.iter_mut().find(|(other, _)| other == name) {
             Some((_, count)) => *count += 1,
-            None => gap.left_out.push((name.clone(), 1)),
+            None => gap.dropped.push((name.clone(), 1)),
         }
         if is_first { self.report.gap_begins() } else { Ok(()) }
     }
@@ -381,7 +380,7 @@ impl<'a> Recorder<'a> {
             }
             self.report.disk(news)?;
         }
-        self.report.progress(&stats, self.left_out)
+        self.report.progress(&stats, self.dropped)
     }
 
     /// Reports what was received of a topic, at the end of the run.
@@ -418,7 +417,7 @@ impl<'a> Recorder<'a> {
             return Err(Failure::new(kind(&error), what, REPAIR).into());
         }
         told.and_then(|()| stats.news.iter().try_for_each(|news| self.report.disk(news)))?;
-        if stays { self.report.end(&stats, self.left_out) } else { Ok(()) }
+        if stays { self.report.end(&stats, self.dropped) } else { Ok(()) }
     }
 }
 

@@ -208,7 +208,7 @@ pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io
             write!(line, " +- ({sd_x:.3}, {sd_y:.3}) m {:.2} deg", sd_yaw.to_degrees())?;
         }
     }
-    if motion.breaks > 0 { write!(line, ", {} steps refused", motion.breaks) } else { Ok(()) }
+    if motion.refused_steps > 0 { write!(line, ", {} steps refused", motion.refused_steps) } else { Ok(()) }
 }
 
 pub(crate) fn early(line: &mut Vec<u8>, header: &Header, early: &Early) -> io::Result<()> {
@@ -274,11 +274,11 @@ pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreg
 pub(crate) fn background(line: &mut Vec<u8>, model: &Background) -> io::Result<()> {
     let far = model.ranges().iter().filter(|&&range| range == Background::FAR).count();
     let frozen = if model.is_frozen() { ", frozen" } else { "" };
-    let BackgroundHead { generation, taught, count, unit_um, .. } = **model;
+    let BackgroundHead { generation, known_beams, count, unit_um, .. } = **model;
     let unit_mm = f64::from(unit_um) / 1000.0;
     write!(
         line,
-        "generation {generation}: {taught} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
+        "generation {generation}: {known_beams} of {count} beams known, {far} far, in {unit_mm} mm{frozen}"
     )
 }
 
@@ -337,7 +337,7 @@ pub(crate) fn cloud(line: &mut Vec<u8>, header: &Header, cloud: &Cloud) -> io::R
     if cloud.has(Cloud::LAST) {
         write!(line, ", the last")?;
     }
-    sweep_words(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::DOUBTED))
+    sweep_words(line, cloud.has(Cloud::COMPLETE), cloud.has(Cloud::UNRELIABLE))
 }
 
 /// Writes number and stamp of a sweep, and its obstacles.
@@ -356,17 +356,17 @@ pub fn obstacles(line: &mut Vec<u8>, header: &Header, found: &Obstacles) -> io::
             write!(line, " too near")?;
         }
     }
-    if found.left_out > 0 {
-        write!(line, ", {} left out", found.left_out)?;
+    if found.dropped > 0 {
+        write!(line, ", {} dropped", found.dropped)?;
     }
-    sweep_words(line, found.has(Obstacles::COMPLETE), found.has(Obstacles::DOUBTED))
+    sweep_words(line, found.has(Obstacles::COMPLETE), found.has(Obstacles::UNRELIABLE))
 }
 
-fn sweep_words(line: &mut Vec<u8>, is_complete: bool, is_doubted: bool) -> io::Result<()> {
+fn sweep_words(line: &mut Vec<u8>, is_complete: bool, is_unreliable: bool) -> io::Result<()> {
     if !is_complete {
         write!(line, ", incomplete")?;
     }
-    if is_doubted { write!(line, ", doubted") } else { Ok(()) }
+    if is_unreliable { write!(line, ", unreliable") } else { Ok(()) }
 }
 
 #[cfg(test)]

@@ -294,7 +294,7 @@ fn a_background_begins_with_a_model_of_its_own_sensor() {
         first_angle: -90_f64.to_radians(),
         step: 0.5_f64.to_radians(),
         unit_um: 1000,
-        taught: 1,
+        known_beams: 1,
         ..BackgroundHead::default()
     };
     let mut model = Background::of(head, &[0; 361]);

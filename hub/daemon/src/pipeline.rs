@@ -399,14 +399,14 @@ mod tests {
     fn a_model_that_has_learned_enough_is_published_again() {
         let mut pipeline = pipeline(&processing(|_| {}));
         pipeline.learn(&wall(361, 1, 3000), None);
-        assert_eq!(shown(&mut pipeline).taught, 0);
+        assert_eq!(shown(&mut pipeline).known_beams, 0);
         for _ in 0..3 {
             pipeline.learn(&wall(361, 1, 3000), None);
             assert!(!pipeline.is_background_due());
         }
         pipeline.learn(&wall(361, 1, 3000), None);
         assert!(pipeline.is_background_due());
-        assert_eq!((shown(&mut pipeline).taught, pipeline.is_background_due()), (361, false));
+        assert_eq!((shown(&mut pipeline).known_beams, pipeline.is_background_due()), (361, false));
         pipeline.handle("a", Verb::Freeze, &Box::<Background>::default()).expect("is kept");
         for _ in 0..9 {
             pipeline.learn(&wall(361, 1, 3000), None);
@@ -421,7 +421,7 @@ mod tests {
         let kept = model.clone();
         let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
         let (first, is_news) = (shown(&mut pipeline), pipeline.is_background_due());
-        assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
+        assert_eq!((first.generation, first.known_beams, first.ranges()[180], is_news), (1, 181, 300, false));
         let reason = pipeline.learn(&wall(361, 10, 300), None);
         assert_eq!(
             reason,
@@ -453,7 +453,7 @@ mod tests {
             (zones.verdict(), foreground.beams)
         };
         let known = shown(&mut pipeline);
-        assert_eq!((told(&mut pipeline, 2000), known.taught), ((Verdict::Clear, 361), 361));
+        assert_eq!((told(&mut pipeline, 2000), known.known_beams), ((Verdict::Clear, 361), 361));
         pipeline.change(&processing(|processing| processing.zones.radii_mm = vec![2500]));
         assert!(!pipeline.is_background_due(), "the background is not concerned");
         assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
@@ -467,7 +467,7 @@ mod tests {
         pipeline.change(&processing(|processing| processing.background.is_kept = false));
         assert!(!pipeline.has_background());
         pipeline.change(&processing(|_| {}));
-        assert_eq!((pipeline.has_background(), shown(&mut pipeline).taught), (true, 0));
+        assert_eq!((pipeline.has_background(), shown(&mut pipeline).known_beams), (true, 0));
     }
 
     #[test]

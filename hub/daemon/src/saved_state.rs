@@ -229,7 +229,7 @@ impl Slot {
         wall_ns: u64,
     ) -> Result<(), Failure> {
         let file = background_file(&self.sensor);
-        if model.taught == 0 {
+        if model.known_beams == 0 {
             // A hub that did not start with the saved model removes it only after a reset of its own model.
             let was_saved = self.saved_wall_ns.swap(0, Ordering::Relaxed) != 0;
             let is_outdated = was_saved || model.generation > 0;
@@ -483,9 +483,9 @@ fn load_background(link: &mut Link, store: &impl StateStore, now_wall_ns: u64) -
     match read_background(&text, &store.location(&file), link) {
         Ok((model, wall_ns)) => {
             let age = Age(Duration::from_nanos(now_wall_ns.saturating_sub(wall_ns)));
-            let (taught, count) = (model.taught, model.count);
+            let (known_beams, count) = (model.known_beams, model.count);
             tracing::info!(
-                "{}: starts with the background saved {age} ago, {taught} of {count} beams known",
+                "{}: starts with the background saved {age} ago, {known_beams} of {count} beams known",
                 link.name
             );
             link.processing.background.model = Some(model);
@@ -667,7 +667,7 @@ mod tests {
             step: 0.5_f64.to_radians(),
             generation: 3,
             unit_um: 1000,
-            taught: 2,
+            known_beams: 2,
             ..BackgroundHead::default()
         };
         let mut model = Background::of(head, &[0; 361]);
@@ -686,7 +686,7 @@ mod tests {
         let text = background_text("front", own.processing.pose, &model, WALL_NS).unwrap();
         assert_eq!(read_background(&text, "f", &own), Ok((model, WALL_NS)));
         let saved = SavedModel::parse(text.as_bytes(), "f").unwrap();
-        assert_eq!((saved.sensor.as_str(), saved.model.taught), ("front", 2), "a user can load it");
+        assert_eq!((saved.sensor.as_str(), saved.model.known_beams), ("front", 2), "a user can load it");
         for (change, why) in [
             ("link.front.pose.x=0.101", "another pose"),
             ("link.front.pose.yaw=1.5708", "another pose"),
@@ -707,7 +707,7 @@ mod tests {
         for (from, to) in [
             ("\"front\"", "\"rear\""),
             ("\"wall_ns\"", "\"wall\""),
-            ("\"taught\":2", "\"taught\":3"),
+            ("\"known_beams\":2", "\"known_beams\":3"),
             ("\"yaw\":0.0", "\"yaw\":null"),
         ] {
             assert!(text.contains(from), "{from}");

@@ -276,12 +276,12 @@ impl Model {
             flags: if self.frozen { Background::FROZEN } else { 0 },
             ..BackgroundHead::default()
         });
-        let mut taught = 0;
+        let mut known_beams = 0;
         for (i, range) in ranges.iter_mut().enumerate() {
             *range = self.learner.background(i, &self.limits);
-            taught += u16::from(*range != Background::UNTAUGHT);
+            known_beams += u16::from(*range != Background::UNKNOWN);
         }
-        out.taught = taught;
+        out.known_beams = known_beams;
     }
 
     /// Returns the method of learning.
@@ -394,7 +394,7 @@ impl Learner {
     /// Uses `ranges` as the background, except those without a reading.
     fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
-            if range != INVALID && range != Background::UNTAUGHT {
+            if range != INVALID && range != Background::UNKNOWN {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
                     Learner::Multi(multi) => multi.adopt(i, range),
@@ -405,7 +405,7 @@ impl Learner {
         }
     }
 
-    /// Returns the background of beam `i` in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
+    /// Returns the background of beam `i` in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
     fn background(&self, i: usize, limits: &Limits) -> u16 {
         match self {
             Learner::Paper(paper) => paper.background(i),

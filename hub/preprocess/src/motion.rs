@@ -83,7 +83,7 @@ struct Track {
     is_open: bool,
     /// The last step.
     step: Rigid,
-    breaks: u16,
+    refused_steps: u16,
 }
 
 impl MotionEstimator {
@@ -178,9 +178,9 @@ impl MotionEstimator {
                     self.take(scan);
                 }
                 self.matcher.trust_all();
-                let breaks = track.breaks.saturating_add(1);
-                (out.method, out.breaks) = (MotionMethod::Refused as u8, breaks);
-                self.keep(Track { step: Rigid::default(), breaks, ..track });
+                let refused_steps = track.refused_steps.saturating_add(1);
+                (out.method, out.refused_steps) = (MotionMethod::Refused as u8, refused_steps);
+                self.keep(Track { step: Rigid::default(), refused_steps, ..track });
             }
         }
     }
@@ -311,7 +311,7 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place
     } as u8;
     let place = track.origin.then(&found.place);
     (out.x_m, out.y_m, out.yaw_rad) = (place.x, place.y, place.yaw);
-    out.breaks = track.breaks;
+    out.refused_steps = track.refused_steps;
     if out.has_valid_pose() {
         let covariance = covariance::of_both(&track.of_origin, of_place, &track.origin, &found.place);
         out.pose_covariance = covariance::rows(&covariance);

@@ -68,7 +68,7 @@ impl Segmenter {
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
         let head = **foreground;
         let ForegroundArrays { segments: places, bits, ranges } = foreground.begin(head);
-        let (mut segments, mut left_out, mut supported) = (0, 0_u16, 0_u64);
+        let (mut segments, mut dropped, mut supported) = (0, 0_u16, 0_u64);
         let (before, mut now) = (&self.before, take(&mut self.room));
         now.used = 0;
         let mut put = |open: &Open, pose: &Pose| match places.get_mut(segments) {
@@ -78,7 +78,7 @@ impl Segmenter {
                 supported |= u64::from(has_support) << segments;
                 segments += 1;
             }
-            None => left_out = left_out.saturating_add(1),
+            None => dropped = dropped.saturating_add(1),
         };
         let mut open: Option<Open> = None;
         self.each_point(scan, bits, ranges, |beam, range, seen, point| {
@@ -99,7 +99,7 @@ impl Segmenter {
         }
         places[segments..].fill(Segment::default());
         foreground.segments = segments as u16;
-        foreground.left_out = left_out;
+        foreground.dropped = dropped;
         foreground.supported = supported;
         self.room = replace(&mut self.before, now);
     }

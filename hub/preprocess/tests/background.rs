@@ -166,8 +166,8 @@ fn paper_is_identical_beam_by_beam() {
         model.show(&mut shown);
         assert_eq!(ranges_mm(&shown), slow.beams.iter().map(|b| b.background_mm).collect::<Vec<_>>());
         assert_eq!((shown.generation, shown.is_frozen()), (generation, slow.frozen));
-        assert_eq!(usize::from(shown.taught), shown.ranges().iter().filter(|&&r| r != 0).count());
-        adopted += u64::from(shown.taught);
+        assert_eq!(usize::from(shown.known_beams), shown.ranges().iter().filter(|&&r| r != 0).count());
+        adopted += u64::from(shown.known_beams);
     }
     assert!(seen.iter().all(|&n| n > 10_000) && adopted > 2_000, "{seen:?}, {adopted}: nothing was tried");
 }
@@ -444,7 +444,7 @@ fn learned_compared_frozen_thawed_and_reset() {
         assert_eq!((model.classes(), shown(&model)), (&[][..], Box::default()));
         look(&mut model, &scan(361, 1, 3_000), 8);
         let known = shown(&model);
-        assert_eq!((known.count, known.taught, known.generation, known.unit_um), (361, 361, 0, 1000));
+        assert_eq!((known.count, known.known_beams, known.generation, known.unit_um), (361, 361, 0, 1000));
         assert!(known.ranges().iter().all(|&range| range == 3_000) && known.ranges().len() == 361);
 
         model.freeze();
@@ -458,7 +458,7 @@ fn learned_compared_frozen_thawed_and_reset() {
         assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 0);
 
         model.reset();
-        assert_eq!((model.generation(), shown(&model).taught, shown(&model).count), (1, 0, 361));
+        assert_eq!((model.generation(), shown(&model).known_beams, shown(&model).count), (1, 0, 361));
         assert_eq!(look(&mut model, &scan(361, 1, 1_000), 1).generation, 1);
         assert!(model.classes().iter().all(|&class| class == Class::Unknown));
     }
@@ -477,9 +477,9 @@ fn another_shape_begins_anew() {
         for other in [scan(181, 1, 3_000), scan(181, 10, 300), scan(361, 1, 3_000), finer, turned] {
             generation += 1;
             assert_eq!(look(&mut model, &other, 1).generation, generation);
-            assert_eq!((shown(&model).taught, shown(&model).count), (0, other.count));
+            assert_eq!((shown(&model).known_beams, shown(&model).count), (0, other.count));
             look(&mut model, &other, 20);
-            assert_eq!((model.generation(), shown(&model).taught), (generation, other.count));
+            assert_eq!((model.generation(), shown(&model).known_beams), (generation, other.count));
         }
     }
 }
@@ -495,7 +495,7 @@ fn a_saved_model_is_taken_if_it_fits() {
         // Before the first scan.
         let mut early = model(method);
         early.load(&saved).unwrap();
-        assert_eq!(shown(&early), with(&saved, |head| (head.generation, head.taught) = (1, 360)));
+        assert_eq!(shown(&early), with(&saved, |head| (head.generation, head.known_beams) = (1, 360)));
         let out = look(&mut early, &scan(361, 1, 1_000), 1);
         assert_eq!((out.generation, out.beams), (1, 360));
 
@@ -503,7 +503,7 @@ fn a_saved_model_is_taken_if_it_fits() {
         let mut wrong = model(method);
         wrong.load(&saved).unwrap();
         assert_eq!(look(&mut wrong, &scan(181, 1, 1_000), 1).generation, 2);
-        assert_eq!((shown(&wrong).taught, shown(&wrong).count), (0, 181));
+        assert_eq!((shown(&wrong).known_beams, shown(&wrong).count), (0, 181));
 
         // Later it is refused, and the model stays what it was.
         let before = shown(&wrong);
@@ -515,7 +515,7 @@ fn a_saved_model_is_taken_if_it_fits() {
         );
         assert_eq!(shown(&wrong), before);
         wrong.load(&short(1000)).unwrap();
-        assert_eq!((wrong.generation(), shown(&wrong).taught), (3, 180));
+        assert_eq!((wrong.generation(), shown(&wrong).known_beams), (3, 180));
     }
 }
 
@@ -529,7 +529,7 @@ fn the_first_scan_may_be_the_background() {
             model.classes().iter().all(|&class| class == Class::Unknown),
             "compared before it is learned"
         );
-        assert_eq!(shown(&model).taught, 361);
+        assert_eq!(shown(&model).known_beams, 361);
         assert_eq!(look(&mut model, &scan(361, 1, 2_000), 1).beams, 361);
         model.reset();
         look(&mut model, &scan(361, 1, 2_000), 1);

@@ -324,9 +324,12 @@ fn a_jump_is_refused_and_what_follows_goes_on() {
         let refused: Vec<usize> =
             (0..found.len()).filter(|&at| methods[at] == MotionMethod::Refused).collect();
         assert_eq!(refused, [40], "{seed}: {methods:?}");
-        assert_eq!(found[40], Motion { method: MotionMethod::Refused as u8, breaks: 1, ..Motion::default() });
+        assert_eq!(
+            found[40],
+            Motion { method: MotionMethod::Refused as u8, refused_steps: 1, ..Motion::default() }
+        );
         let (before, after) = (&found[39], &found[41]);
-        assert_eq!((before.breaks, after.breaks), (0, 1));
+        assert_eq!((before.refused_steps, after.refused_steps), (0, 1));
         assert!(
             (before.x_m - after.x_m).hypot(before.y_m - after.y_m) < 0.05,
             "the sum goes on where it was"

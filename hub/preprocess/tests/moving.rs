@@ -222,7 +222,7 @@ fn what_it_shows_is_what_stands() {
     let scan = &drive.scans[0];
     let near = |i: &usize| {
         let (shown, range) = (shown.ranges()[*i], scan.ranges()[*i]);
-        shown != Background::UNTAUGHT && shown.abs_diff(range) < 200
+        shown != Background::UNKNOWN && shown.abs_diff(range) < 200
     };
     let count = (0..361).filter(near).count();
     assert!(count > 300, "{count} of 361, those along walls aside");

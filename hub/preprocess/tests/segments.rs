@@ -90,7 +90,7 @@ fn segments_are_those_of_the_formula() {
         let mut out = foreground(&ranges);
         Segmenter::new(pose, BEAMS).update(&scan, &mut out);
         assert_eq!(usize::from(out.segments), expected.len().min(SEGMENTS), "round {round}");
-        assert_eq!(usize::from(out.left_out), expected.len().saturating_sub(SEGMENTS));
+        assert_eq!(usize::from(out.dropped), expected.len().saturating_sub(SEGMENTS));
         let (used, head) = (out.segments().len(), **out);
         assert!(out.clone().begin(head).segments[used..].iter().all(|rest| *rest == Segment::default()));
         for (segment, beams) in out.segments().iter().zip(expected) {

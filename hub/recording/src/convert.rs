@@ -65,7 +65,7 @@ pub struct Converted {
     pub marks: Option<u64>,
     /// Telegrams that the format cannot hold: in a CARMEN log all but whole scans, for ROS 2 and CSV all but scans. The reply that
     /// contains the encoding of a log does not count.
-    pub left_out: u64,
+    pub dropped: u64,
     /// Data of a log that no telegram holds.
     pub unread: Unread,
     /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None` if there
@@ -154,7 +154,7 @@ pub fn convert(
             telegrams: 0,
             scans: 0,
             marks: None,
-            left_out: 0,
+            dropped: 0,
             unread: contents.unread,
             took_ns: None,
             damage: contents.damage,
@@ -251,7 +251,7 @@ impl Conversion<'_> {
         }
         converted.telegrams += u64::from(matches!(written, Written::Scan | Written::Other));
         converted.scans += u64::from(matches!(written, Written::Scan | Written::Marks));
-        converted.left_out += u64::from(written == Written::LeftOut);
+        converted.dropped += u64::from(written == Written::LeftOut);
         self.done += 1;
         if self.done.is_multiple_of(PROGRESS_INTERVAL) {
             (self.progress)(self.done, self.recording.contents().telegrams);

@@ -67,7 +67,7 @@ fn scan(scan: &Scan) -> Value {
     json!({
         "family": Family::of_number(scan.family).map(Family::name), "unit_um": scan.unit_um, "count": scan.count,
         "first_angle": scan.first_angle, "step": scan.step, "spacing": scan.spacing, "beam_time_ns": scan.beam_time_ns, "valid_to": scan.valid_to,
-        "no_return": scan.no_return, "beyond": scan.beyond, "collapsed": scan.collapsed,
+        "no_return": scan.no_return, "beyond": scan.beyond, "collisions": scan.collisions,
         "incomplete": scan.is_incomplete(), "intensity_bits": scan.intensity_bits,
         "ranges": scan.ranges(), "codes": each(&|i| scan.code(i).map(Code::name).into()),
         "times_ns": each(&|i| scan.beam_ns(i).into()),
@@ -111,7 +111,7 @@ fn motion(motion: &Motion) -> Value {
     json!({
         "x_m": motion.x_m, "y_m": motion.y_m, "yaw_rad": motion.yaw_rad, "dx_m": motion.dx_m, "dy_m": motion.dy_m,
         "dyaw_rad": motion.dyaw_rad, "covariance": motion.covariance, "overlap": motion.overlap,
-        "method": motion.how().name(), "valid": motion.has_valid_pose(), "degenerate": motion.is_degenerate(), "breaks": motion.breaks,
+        "method": motion.how().name(), "valid": motion.has_valid_pose(), "degenerate": motion.is_degenerate(), "refused_steps": motion.refused_steps,
         "pose_covariance": motion.pose_covariance,
     })
 }
@@ -160,7 +160,7 @@ fn cloud(cloud: &Cloud) -> Value {
     json!({
         "sweep": cloud.sweep, "generation": cloud.generation, "first": cloud.has(Cloud::FIRST),
         "last": cloud.has(Cloud::LAST), "complete": cloud.has(Cloud::COMPLETE),
-        "doubted": cloud.has(Cloud::DOUBTED), "points": list.collect::<Vec<_>>(),
+        "unreliable": cloud.has(Cloud::UNRELIABLE), "points": list.collect::<Vec<_>>(),
     })
 }
 
@@ -175,7 +175,7 @@ fn obstacles(found: &Obstacles) -> Value {
     });
     json!({
         "sweep": found.sweep, "generation": found.generation, "complete": found.has(Obstacles::COMPLETE),
-        "doubted": found.has(Obstacles::DOUBTED), "left_out": found.left_out,
+        "unreliable": found.has(Obstacles::UNRELIABLE), "dropped": found.dropped,
         "obstacles": list.collect::<Vec<_>>(),
     })
 }
@@ -203,7 +203,7 @@ fn foreground(foreground: &Foreground) -> Value {
     });
     json!({
         "generation": foreground.generation, "count": foreground.count, "unit_um": foreground.unit_um,
-        "left_out": foreground.left_out,
+        "dropped": foreground.dropped,
         "beams": foreground.readings().map(|(beam, _)| beam).collect::<Vec<_>>(),
         "ranges": foreground.ranges(), "segments": segments.collect::<Vec<_>>(),
     })
@@ -211,7 +211,7 @@ fn foreground(foreground: &Foreground) -> Value {
 
 fn background(model: &Background) -> Value {
     json!({
-        "generation": model.generation, "taught": model.taught, "count": model.count,
+        "generation": model.generation, "known_beams": model.known_beams, "count": model.count,
         "unit_um": model.unit_um, "first_angle": model.first_angle, "step": model.step, "frozen": model.is_frozen(), "ranges": model.ranges(),
     })
 }

@@ -179,7 +179,7 @@ fn turn() -> Box<Scan> {
         valid_to: 0xFFEF,
         no_return: Code::NoReturn.value(),
         beyond: Code::NoReturn.value(),
-        collapsed: 5,
+        collisions: 5,
         family: Family::Ld as u8,
         flags: Scan::INCOMPLETE,
         contents: Contents::ALL,
@@ -236,7 +236,7 @@ fn motion() -> Motion {
         overlap: 0.875,
         method: MotionMethod::Lines as u8,
         flags: Motion::DEGENERATE,
-        breaks: 2,
+        refused_steps: 2,
         pose_covariance: [0.5, 0.125, 0.0, 0.125, 0.25, 0.0, 0.0, 0.0, 0.015625],
         reserved: 0,
     }
@@ -308,7 +308,7 @@ fn foreground() -> Box<Foreground> {
         count: 361,
         beams: 192,
         segments: 64,
-        left_out: 0,
+        dropped: 0,
         supported: 0x8123_4567_89AB_CDEF,
     };
     let arrays = foreground.begin(head);
@@ -336,12 +336,12 @@ fn background() -> Box<Background> {
         step: 1_f64.to_radians(),
         generation: 9,
         unit_um: 10_000,
-        taught: 162,
+        known_beams: 162,
         flags: Background::FROZEN,
         ..BackgroundHead::default()
     };
     let range = |i: u16| match i % 10 {
-        0 => Background::UNTAUGHT,
+        0 => Background::UNKNOWN,
         1 => Background::FAR,
         _ => 3000 + i,
     };
@@ -388,7 +388,7 @@ fn obstacles() -> Obstacles {
     let mut found = Obstacles {
         sweep: 12,
         generation: 3,
-        left_out: 1,
+        dropped: 1,
         flags: Obstacles::COMPLETE,
         ..Obstacles::default()
     };

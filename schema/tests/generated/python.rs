@@ -28,16 +28,16 @@ const ORDER: [(&str, &[&str]); 6] = [
             "valid_to",
             "no_return",
             "beyond",
-            "collapsed",
+            "collisions",
             "incomplete",
             "intensity_bits",
         ],
     ),
-    ("Foreground", &["generation", "count", "unit_um", "left_out"]),
-    ("Background", &["generation", "taught", "count", "unit_um", "first_angle", "step", "frozen"]),
+    ("Foreground", &["generation", "count", "unit_um", "dropped"]),
+    ("Background", &["generation", "known_beams", "count", "unit_um", "first_angle", "step", "frozen"]),
     ("TrackSensor", &["name"]),
     ("Event", &["kind"]),
-    ("Obstacles", &["sweep", "generation", "complete", "doubted", "left_out"]),
+    ("Obstacles", &["sweep", "generation", "complete", "unreliable", "dropped"]),
 ];
 
 /// Returns the name of a layout's class.

@@ -89,7 +89,7 @@ pub(crate) fn scans() -> Vec<Box<Scan>> {
             first_beam_ns: -99_999_999,
             unit_um: 250,
             valid_to: 0xFFEF,
-            collapsed: 7,
+            collisions: 7,
             family: Family::Ld as u8,
             flags: Scan::INCOMPLETE,
             contents,

@@ -58,8 +58,8 @@ static void scan(const struct scanhub_scan *s)
     number(",\"first_angle\":", s->first_angle);
     number(",\"step\":", s->step);
     number(",\"spacing\":", s->spacing);
-    printf(",\"beam_time_ns\":%lu,\"valid_to\":%u,\"no_return\":%u,\"beyond\":%u,\"collapsed\":%u,\"incomplete\":%s",
-           (unsigned long)s->beam_time_ns, s->valid_to, s->no_return, s->beyond, s->collapsed, boolean(s->incomplete));
+    printf(",\"beam_time_ns\":%lu,\"valid_to\":%u,\"no_return\":%u,\"beyond\":%u,\"collisions\":%u,\"incomplete\":%s",
+           (unsigned long)s->beam_time_ns, s->valid_to, s->no_return, s->beyond, s->collisions, boolean(s->incomplete));
     printf(",\"intensity_bits\":%u,\"ranges\":[", s->intensity_bits);
     for (unsigned i = 0; i < s->count; i++)
         printf("%s%u", i ? "," : "", scanhub_scan_range(s, i));
@@ -158,8 +158,8 @@ static void cloud(const struct scanhub_cloud *c)
     static const char *const classes[] = {"unknown", "background", "foreground", "behind"};
     printf("{\"sweep\":%lu,\"generation\":%lu,\"first\":%s", (unsigned long)c->sweep, (unsigned long)c->generation,
            boolean(c->first));
-    printf(",\"last\":%s,\"complete\":%s,\"doubted\":%s,\"points\":[", boolean(c->last), boolean(c->complete),
-           boolean(c->doubted));
+    printf(",\"last\":%s,\"complete\":%s,\"unreliable\":%s,\"points\":[", boolean(c->last), boolean(c->complete),
+           boolean(c->unreliable));
     for (unsigned i = 0; i < c->count; i++) {
         struct scanhub_point p = scanhub_point(c, i);
         number(i ? ",{\"x_m\":" : "{\"x_m\":", p.x_m);
@@ -174,7 +174,7 @@ static void obstacles(const struct scanhub_obstacles *s)
 {
     printf("{\"sweep\":%lu,\"generation\":%lu,\"complete\":%s", (unsigned long)s->sweep, (unsigned long)s->generation,
            boolean(s->complete));
-    printf(",\"doubted\":%s,\"left_out\":%lu,\"obstacles\":[", boolean(s->doubted), (unsigned long)s->left_out);
+    printf(",\"unreliable\":%s,\"dropped\":%lu,\"obstacles\":[", boolean(s->unreliable), (unsigned long)s->dropped);
     for (unsigned i = 0; i < s->count; i++) {
         struct scanhub_obstacle o = scanhub_obstacle(s, i);
         number(i ? ",{\"x_m\":" : "{\"x_m\":", o.x_m);
@@ -230,8 +230,8 @@ static void motion(const struct scanhub_motion *m)
     for (unsigned i = 0; i < 9; i++)
         number(i ? "," : ",\"covariance\":[", m->covariance[i]);
     number("],\"overlap\":", m->overlap);
-    printf(",\"method\":\"%s\",\"valid\":%s,\"degenerate\":%s,\"breaks\":%u", methods[m->method < 6 ? m->method : 1],
-           boolean(m->valid), boolean(m->degenerate), m->breaks);
+    printf(",\"method\":\"%s\",\"valid\":%s,\"degenerate\":%s,\"refused_steps\":%u", methods[m->method < 6 ? m->method : 1],
+           boolean(m->valid), boolean(m->degenerate), m->refused_steps);
     for (unsigned i = 0; i < 9; i++)
         number(i ? "," : ",\"pose_covariance\":[", m->pose_covariance[i]);
     printf("]}");
@@ -257,8 +257,8 @@ static void zones(const struct scanhub_zones *z)
 static void foreground(const struct scanhub_foreground *f)
 {
     unsigned n = 0;
-    printf("{\"generation\":%lu,\"count\":%u,\"unit_um\":%lu,\"left_out\":%u,\"beams\":[", (unsigned long)f->generation,
-           f->count, (unsigned long)f->unit_um, f->left_out);
+    printf("{\"generation\":%lu,\"count\":%u,\"unit_um\":%lu,\"dropped\":%u,\"beams\":[", (unsigned long)f->generation,
+           f->count, (unsigned long)f->unit_um, f->dropped);
     for (unsigned i = 0; i < f->count; i++)
         if (scanhub_is_foreground(f, i))
             printf("%s%u", n++ ? "," : "", i);
@@ -276,7 +276,7 @@ static void foreground(const struct scanhub_foreground *f)
 
 static void background(const struct scanhub_background *b)
 {
-    printf("{\"generation\":%lu,\"taught\":%u,\"count\":%u,\"unit_um\":%lu", (unsigned long)b->generation, b->taught,
+    printf("{\"generation\":%lu,\"known_beams\":%u,\"count\":%u,\"unit_um\":%lu", (unsigned long)b->generation, b->known_beams,
            b->count, (unsigned long)b->unit_um);
     number(",\"first_angle\":", b->first_angle);
     number(",\"step\":", b->step);

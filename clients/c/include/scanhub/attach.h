@@ -157,7 +157,7 @@ struct scanhub_scan_v2 {
     uint16_t beyond; /* Code of an echo from beyond the range limit; `no_return` if the family has none. */
     /* Number of points that were dropped because another point has the same beam. Points without a return count,
      * too. */
-    uint16_t collapsed;
+    uint16_t collisions;
     uint8_t family; /* Family of the scanner: SCANHUB_FAMILY_... */
     uint8_t flags; /* Flags: SCANHUB_SCAN_FLAG_... */
     uint8_t contents; /* Arrays that follow the head: SCANHUB_SCAN_... */
@@ -245,7 +245,7 @@ struct scanhub_foreground_v2 {
     uint16_t count; /* Number of beams of the scan. */
     uint16_t beams; /* Number of beams in the foreground. */
     uint16_t segments; /* Number of segments, at most 64. */
-    uint16_t left_out; /* Number of segments that did not fit. */
+    uint16_t dropped; /* Number of segments that did not fit. */
     /* Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
      * it. */
     uint64_t supported;
@@ -263,7 +263,7 @@ struct scanhub_background_v2 {
      * unit. */
     uint32_t generation;
     uint32_t unit_um; /* Micrometers per device unit. */
-    uint16_t taught; /* Number of beams whose background is known. */
+    uint16_t known_beams; /* Number of beams whose background is known. */
     uint16_t count; /* Number of beams of the model; 0 before the first scan. */
     uint8_t flags; /* Flags: SCANHUB_BACKGROUND_... */
     uint8_t reserved[3];
@@ -414,7 +414,7 @@ struct scanhub_motion_v2 {
     uint8_t method; /* Method: SCANHUB_METHOD_... Treat every other number as refused. */
     uint8_t flags; /* Flags: SCANHUB_MOTION_... */
     /* Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out. */
-    uint16_t breaks;
+    uint16_t refused_steps;
     /* Covariance of the summed pose in the frame of the start, in the layout of `covariance`. Refused steps add nothing
      * to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. */
     float pose_covariance[9];
@@ -523,12 +523,12 @@ struct scanhub_cloud_point_v2 {
 };
 
 /* Flags of struct scanhub_cloud_v2. */
-#define SCANHUB_SWEEP_FIRST    1 /* The first sample of its sweep. */
-#define SCANHUB_SWEEP_LAST     2 /* The last sample of its sweep. */
+#define SCANHUB_SWEEP_FIRST      1 /* The first sample of its sweep. */
+#define SCANHUB_SWEEP_LAST       2 /* The last sample of its sweep. */
 /* The sweep went from one reversal of the mount to the next, and no angle was missing. */
-#define SCANHUB_SWEEP_COMPLETE 4
+#define SCANHUB_SWEEP_COMPLETE   4
 /* The sweep is unreliable, because its angles contradict the background. The class of all points is unknown. */
-#define SCANHUB_SWEEP_DOUBTED  8
+#define SCANHUB_SWEEP_UNRELIABLE 8
 
 /* Head of a cloud, before the points. 16 bytes. The arrays that follow: points (struct scanhub_cloud_point_v2). Use the
  * functions below to read them. */
@@ -561,7 +561,7 @@ struct scanhub_obstacle_v2 {
 struct scanhub_obstacles_v2 {
     uint32_t sweep; /* Number of the sweep, as in topic `cloud`. */
     uint32_t generation; /* Generation of the background, as in topic `cloud`. */
-    uint32_t left_out; /* Number of obstacles that did not fit. */
+    uint32_t dropped; /* Number of obstacles that did not fit. */
     uint8_t count; /* Number of obstacles, at most 64. */
     uint8_t flags; /* Flags: SCANHUB_SWEEP_... */
     uint8_t reserved[2];
@@ -819,7 +819,7 @@ static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsig
 static inline unsigned scanhub_collapsed(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
-    return head == NULL ? 0 : head->collapsed;
+    return head == NULL ? 0 : head->collisions;
 }
 
 /* 1: packets of the turn are missing. Their points are not measured. */
@@ -952,7 +952,7 @@ SCANHUB_AT(scanhub_scan_v2, count, 32);
 SCANHUB_AT(scanhub_scan_v2, valid_to, 34);
 SCANHUB_AT(scanhub_scan_v2, no_return, 36);
 SCANHUB_AT(scanhub_scan_v2, beyond, 38);
-SCANHUB_AT(scanhub_scan_v2, collapsed, 40);
+SCANHUB_AT(scanhub_scan_v2, collisions, 40);
 SCANHUB_AT(scanhub_scan_v2, family, 42);
 SCANHUB_AT(scanhub_scan_v2, flags, 43);
 SCANHUB_AT(scanhub_scan_v2, contents, 44);
@@ -1001,14 +1001,14 @@ SCANHUB_AT(scanhub_foreground_v2, unit_um, 4);
 SCANHUB_AT(scanhub_foreground_v2, count, 8);
 SCANHUB_AT(scanhub_foreground_v2, beams, 10);
 SCANHUB_AT(scanhub_foreground_v2, segments, 12);
-SCANHUB_AT(scanhub_foreground_v2, left_out, 14);
+SCANHUB_AT(scanhub_foreground_v2, dropped, 14);
 SCANHUB_AT(scanhub_foreground_v2, supported, 16);
 SCANHUB_SIZE(scanhub_background_v2, 32);
 SCANHUB_AT(scanhub_background_v2, first_angle, 0);
 SCANHUB_AT(scanhub_background_v2, step, 8);
 SCANHUB_AT(scanhub_background_v2, generation, 16);
 SCANHUB_AT(scanhub_background_v2, unit_um, 20);
-SCANHUB_AT(scanhub_background_v2, taught, 24);
+SCANHUB_AT(scanhub_background_v2, known_beams, 24);
 SCANHUB_AT(scanhub_background_v2, count, 26);
 SCANHUB_AT(scanhub_background_v2, flags, 28);
 SCANHUB_AT(scanhub_background_v2, reserved, 29);
@@ -1072,7 +1072,7 @@ SCANHUB_AT(scanhub_motion_v2, covariance, 36);
 SCANHUB_AT(scanhub_motion_v2, overlap, 72);
 SCANHUB_AT(scanhub_motion_v2, method, 76);
 SCANHUB_AT(scanhub_motion_v2, flags, 77);
-SCANHUB_AT(scanhub_motion_v2, breaks, 78);
+SCANHUB_AT(scanhub_motion_v2, refused_steps, 78);
 SCANHUB_AT(scanhub_motion_v2, pose_covariance, 80);
 SCANHUB_AT(scanhub_motion_v2, reserved, 116);
 SCANHUB_SIZE(scanhub_early_v2, 12);
@@ -1141,7 +1141,7 @@ SCANHUB_AT(scanhub_obstacle_v2, reserved, 45);
 SCANHUB_SIZE(scanhub_obstacles_v2, 3088);
 SCANHUB_AT(scanhub_obstacles_v2, sweep, 0);
 SCANHUB_AT(scanhub_obstacles_v2, generation, 4);
-SCANHUB_AT(scanhub_obstacles_v2, left_out, 8);
+SCANHUB_AT(scanhub_obstacles_v2, dropped, 8);
 SCANHUB_AT(scanhub_obstacles_v2, count, 12);
 SCANHUB_AT(scanhub_obstacles_v2, flags, 13);
 SCANHUB_AT(scanhub_obstacles_v2, reserved, 14);

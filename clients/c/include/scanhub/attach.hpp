@@ -7,7 +7,7 @@
  *
  *     scanhub::Attachment scans("front", SCANHUB_TOPIC_SCAN);
  *     while (scanhub::Sample sample = scans.next())
- *         use(scanhub_range_m(&*sample, 180), sample.as<scanhub_scan_v2>().collapsed);
+ *         use(scanhub_range_m(&*sample, 180), sample.as<scanhub_scan_v2>().collisions);
  */
 #ifndef SCANHUB_ATTACH_HPP
 #define SCANHUB_ATTACH_HPP

@@ -177,9 +177,9 @@ impl<'a> Report<'a> {
     }
 
     /// Reports a problem.
-    pub(super) fn trouble(&mut self, what: &str) -> Result<(), End> {
+    pub(super) fn problem(&mut self, what: &str) -> Result<(), End> {
         if self.json {
-            let notice = Notice::of("trouble", &Head::default());
+            let notice = Notice::of("problem", &Head::default());
             return self.out.json(&Notice { hub: None, epoch: None, message: Some(what), ..notice });
         }
         self.notes.line(|line| write!(line, "{what}"))

@@ -12,7 +12,7 @@ use std::ops::Range;
 
 use hall::Hall;
 use judge::{Score, Seen, Things, seconds, share};
-use scanhub_perception::tilt::{Settings, Withheld};
+use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 
@@ -47,7 +47,7 @@ fn main() -> Result<(), scanhub_schema::Failure> {
     }
     if is_wanted("faults") {
         println!(
-            "fault from 20 to 24 s: beams withheld (silent, jumped, inconsistent, standing), sweeps doubted of all"
+            "fault from 20 to 24 s: beams points_dropped (silent, jumped, inconsistent, standing), sweeps unreliable of all"
         );
         println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
         for (name, kind) in FAULTS {
@@ -115,10 +115,10 @@ fn changing(halls: Range<u64>) {
 /// Stamps of angles that are wrong from the start, in halls in which nothing changes.
 fn late_stamps() {
     println!(
-        "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; doubted sweeps"
+        "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; unreliable sweeps"
     );
     for by_s in [0.0, 0.005, 0.01, 0.03, 0.1, -0.03] {
-        let (mut errors, mut obstacles, mut doubted, mut sweeps) = (Vec::new(), 0, 0, 0);
+        let (mut errors, mut obstacles, mut unreliable, mut sweeps) = (Vec::new(), 0, 0, 0);
         let mut found = Vec::new();
         for seed in 0..4 {
             let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
@@ -131,12 +131,12 @@ fn late_stamps() {
                 }
             });
             found.push(hall.late_ns as f64 / 1e6);
-            (doubted, sweeps) = (doubted + counts.doubted, sweeps + counts.sweeps);
+            (unreliable, sweeps) = (unreliable + counts.unreliable, sweeps + counts.sweeps);
         }
         errors.sort_by(f64::total_cmp);
         let at = |share: f64| 1000.0 * errors[((errors.len() - 1) as f64 * share) as usize];
         println!(
-            "  {:4.0} ms: {found:.1?} ms; {:.1} mm, {:.1} mm; {obstacles}; {doubted} of {sweeps}",
+            "  {:4.0} ms: {found:.1?} ms; {:.1} mm, {:.1} mm; {obstacles}; {unreliable} of {sweeps}",
             1000.0 * by_s,
             at(0.5),
             at(0.99)
@@ -196,15 +196,15 @@ fn fault(world: &World, name: &str, kind: FaultKind) {
     // Nobody has come yet.
     let world = world.clone().with_mount_faults(&[fault]);
     let counts = Hall::new(&world, 1).play(Settings::default(), 29, |hall, sweep| {
-        if !sweep.is_doubted {
+        if !sweep.is_unreliable {
             most = sweep.points.iter().map(|point| hall.error_m(point)).fold(most, f64::max);
             invented += if sweep.until_ns < seconds(24) { sweep.obstacles.len() } else { 0 };
         }
     });
-    let [silent, jumped, inconsistent, standing]: [u64; Withheld::COUNT] = counts.withheld;
+    let [silent, jumped, inconsistent, standing]: [u64; DropReason::COUNT] = counts.points_dropped;
     println!(
         "{name:20} {silent:6} {jumped:6} {inconsistent:6} {standing:6}  {} of {}  {:.1} mm  {invented}",
-        counts.doubted,
+        counts.unreliable,
         counts.sweeps,
         1000.0 * most
     );

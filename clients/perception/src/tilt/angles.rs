@@ -22,7 +22,7 @@ pub struct Angle {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(usize)]
-pub enum Withheld {
+pub enum DropReason {
     /// No angle was reported for that time, or it arrived too late.
     Silent,
     /// The angle jumps, or has jumped recently.
@@ -33,7 +33,7 @@ pub enum Withheld {
     Standing,
 }
 
-impl Withheld {
+impl DropReason {
     /// Number of reasons.
     pub const COUNT: usize = 4;
 }
@@ -44,7 +44,7 @@ pub(crate) enum AngleLookup {
     Known(f64),
     /// No later angle has arrived yet.
     Open,
-    Never(Withheld),
+    Never(DropReason),
 }
 
 /// Effect of a new angle.
@@ -62,7 +62,7 @@ pub(crate) enum AngleUpdate {
 struct Entry {
     angle: Angle,
     /// Reason why the angles between the last one and this one are unknown.
-    torn: Option<Withheld>,
+    torn: Option<DropReason>,
 }
 
 /// The most recent angles.
@@ -93,22 +93,22 @@ impl Angles {
         counts: &mut Counts,
     ) -> AngleUpdate {
         if !angle.angle_rad.is_finite() {
-            counts.angles_unfit += 1;
+            counts.angles_invalid += 1;
             return AngleUpdate::Dropped;
         }
         if scan_ns.is_some_and(|scan_ns| angle.stamp_ns > scan_ns.saturating_add(JUMP_NS)) {
-            counts.angles_ahead += 1;
+            counts.angles_in_future += 1;
             return AngleUpdate::Dropped;
         }
         let Some(before) = self.entries.back().map(|entry| entry.angle) else {
-            self.entries.push_back(Entry { angle, torn: Some(Withheld::Silent) });
+            self.entries.push_back(Entry { angle, torn: Some(DropReason::Silent) });
             return AngleUpdate::Torn;
         };
         if angle.stamp_ns <= before.stamp_ns {
-            counts.angles_unordered += 1;
+            counts.angles_out_of_order += 1;
             if before.stamp_ns - angle.stamp_ns > JUMP_NS {
                 self.entries.clear();
-                self.entries.push_back(Entry { angle, torn: Some(Withheld::Silent) });
+                self.entries.push_back(Entry { angle, torn: Some(DropReason::Silent) });
                 return AngleUpdate::Torn;
             }
             return AngleUpdate::Dropped;
@@ -121,23 +121,23 @@ impl Angles {
         if torn.is_some() { AngleUpdate::Torn } else { AngleUpdate::On }
     }
 
-    fn torn(&mut self, before: &Angle, angle: &Angle, settings: &Settings) -> Option<Withheld> {
+    fn torn(&mut self, before: &Angle, angle: &Angle, settings: &Settings) -> Option<DropReason> {
         let lasts_ns = angle.stamp_ns - before.stamp_ns;
         let speed = (angle.angle_rad - before.angle_rad) / (lasts_ns as f64 * 1e-9);
         if lasts_ns > settings.gap_ns {
-            return Some(Withheld::Silent);
+            return Some(DropReason::Silent);
         }
         if speed.abs() > settings.fastest_rad_s {
             self.settled_ns = angle.stamp_ns.saturating_add(settings.settle_ns);
         }
         if angle.stamp_ns <= self.settled_ns {
-            return Some(Withheld::Jumped);
+            return Some(DropReason::Jumped);
         }
         // At a reversal, the rates differ, and the speed is between them.
         let (least, most) =
             (before.rate_rad_s.min(angle.rate_rad_s), before.rate_rad_s.max(angle.rate_rad_s));
         let is_off = speed < least - settings.rate_rad_s || speed > most + settings.rate_rad_s;
-        is_off.then_some(Withheld::Inconsistent)
+        is_off.then_some(DropReason::Inconsistent)
     }
 
     /// Marks all angles after the one with the stamp `since_ns` as standing.
@@ -147,7 +147,7 @@ impl Angles {
             .iter_mut()
             .rev()
             .take_while(stands)
-            .for_each(|entry| entry.torn = Some(Withheld::Standing));
+            .for_each(|entry| entry.torn = Some(DropReason::Standing));
     }
 
     /// Returns the delay of all stamps.
@@ -171,8 +171,8 @@ impl Angles {
     }
 
     /// Returns the reason why the angles before the last one are unknown.
-    pub(crate) fn trouble(&self) -> Option<Withheld> {
-        self.entries.back().map_or(Some(Withheld::Silent), |entry| entry.torn)
+    pub(crate) fn problem(&self) -> Option<DropReason> {
+        self.entries.back().map_or(Some(DropReason::Silent), |entry| entry.torn)
     }
 
     /// Returns the angle at `time_ns`, interpolated between those before and after.
@@ -181,7 +181,7 @@ impl Angles {
         let after = self.entries.partition_point(|entry| entry.angle.stamp_ns < time_ns);
         let Some(Entry { angle, torn }) = self.entries.get(after) else { return AngleLookup::Open };
         let Some(before) = after.checked_sub(1).map(|i| self.entries[i].angle) else {
-            return AngleLookup::Never(Withheld::Silent);
+            return AngleLookup::Never(DropReason::Silent);
         };
         match torn {
             Some(why) => AngleLookup::Never(*why),
@@ -297,19 +297,19 @@ mod tests {
         assert_eq!([15, 20, 30, 40].map(|ms| deg(&angles, ms)), [1.5, 2.0, 1.5, 1.0].map(Some));
         assert_eq!(
             (angles.at(9 * MS), angles.at(41 * MS)),
-            (AngleLookup::Never(Withheld::Silent), AngleLookup::Open)
+            (AngleLookup::Never(DropReason::Silent), AngleLookup::Open)
         );
     }
 
     #[test]
     fn a_silence_and_a_jump_are_no_way() {
         let (silent, ..) = angles(&[(10, 1.0), (20, 2.0), (200, 3.0), (210, 4.0)]);
-        assert_eq!(silent.at(100 * MS), AngleLookup::Never(Withheld::Silent));
+        assert_eq!(silent.at(100 * MS), AngleLookup::Never(DropReason::Silent));
         assert_eq!(deg(&silent, 205), Some(3.5));
         let said: Vec<_> = (0..80).map(|i| (10 * i, if i < 5 { 0.0 } else { 8.0 })).collect();
         let (jumped, steps, _) = angles(&said);
-        assert_eq!(jumped.at(45 * MS), AngleLookup::Never(Withheld::Jumped));
-        assert_eq!(jumped.at(300 * MS), AngleLookup::Never(Withheld::Jumped), "not settled");
+        assert_eq!(jumped.at(45 * MS), AngleLookup::Never(DropReason::Jumped));
+        assert_eq!(jumped.at(300 * MS), AngleLookup::Never(DropReason::Jumped), "not settled");
         assert_eq!(deg(&jumped, 600), Some(8.0));
         assert_eq!(steps.iter().filter(|step| **step == AngleUpdate::On).count(), 4 + 80 - 5 - 51);
     }
@@ -320,7 +320,7 @@ mod tests {
             angles(&[(1500, 1.0), (1490, 1.0), (2100, 1.0), (1510, 2.0), (100, 3.0), (110, 4.0)]);
         use AngleUpdate::{Dropped as D, On, Torn};
         assert_eq!(steps, [Torn, D, D, On, Torn, On]);
-        assert_eq!((counts.angles_unordered, counts.angles_ahead, counts.angles_unfit), (2, 1, 0));
+        assert_eq!((counts.angles_out_of_order, counts.angles_in_future, counts.angles_invalid), (2, 1, 0));
         assert_eq!(deg(&angles, 105), Some(3.5), "the clock was set back");
     }
 
@@ -338,7 +338,7 @@ mod tests {
             [AngleUpdate::Torn, AngleUpdate::On, AngleUpdate::On]
         );
         assert_eq!([say(30, -0.2, 30.0), say(40, -0.5, 30.0)], [AngleUpdate::On, AngleUpdate::Torn]);
-        assert_eq!(angles.at(35 * MS), AngleLookup::Never(Withheld::Inconsistent));
+        assert_eq!(angles.at(35 * MS), AngleLookup::Never(DropReason::Inconsistent));
     }
 
     #[test]
@@ -346,7 +346,7 @@ mod tests {
         let (mut angles, ..) = angles(&[(10, 1.0), (20, 2.0), (30, 2.0), (40, 2.0)]);
         angles.stand_since(20 * MS);
         assert_eq!(deg(&angles, 15), Some(1.5));
-        assert_eq!(angles.at(25 * MS), AngleLookup::Never(Withheld::Standing));
+        assert_eq!(angles.at(25 * MS), AngleLookup::Never(DropReason::Standing));
     }
 
     fn events(degrees: impl Iterator<Item = f64>) -> Vec<SwingEvent> {

@@ -29,7 +29,7 @@ pub(crate) struct SweepAnalyzer {
     settings: Settings,
     model: Model,
     /// Number of resets of the model.
-    pub(crate) forgotten: u64,
+    pub(crate) background_resets: u64,
     points: Vec<Point>,
     /// Row of the model and reading of each beam.
     readings: Vec<(usize, Reading)>,
@@ -43,7 +43,7 @@ pub(crate) struct SweepAnalyzer {
     /// Whether the floor has been where the angles put it since their last jump.
     is_confirmed: bool,
     /// Number of unreliable sweeps in a row.
-    doubted: u16,
+    unreliable: u16,
 }
 
 impl SweepAnalyzer {
@@ -52,7 +52,7 @@ impl SweepAnalyzer {
             mount,
             settings,
             model: Model::new(0, &settings),
-            forgotten: 0,
+            background_resets: 0,
             points: Vec::new(),
             readings: Vec::new(),
             off: Vec::new(),
@@ -60,14 +60,14 @@ impl SweepAnalyzer {
             beams: Vec::new(),
             clusters: Clusters::default(),
             is_confirmed: true,
-            doubted: 0,
+            unreliable: 0,
         }
     }
 
     /// Starts with a new background for scans with this number of beams.
     pub(crate) fn begin(&mut self, beams: usize, is_first: bool) {
         self.model = Model::new(beams, &self.settings);
-        self.forgotten += u64::from(!is_first);
+        self.background_resets += u64::from(!is_first);
     }
 
     /// Marks the angles as unreliable after a jump, until the floor is where they put it.
@@ -78,9 +78,9 @@ impl SweepAnalyzer {
     /// Forgets the background, because all angles are corrected from now on. If the last sweep contradicted the background,
     /// the angles were right when it was learned, and it stays.
     pub(crate) fn correct(&mut self) {
-        if self.doubted == 0 {
+        if self.unreliable == 0 {
             self.model.forget();
-            self.forgotten += 1;
+            self.background_resets += 1;
         }
     }
 
@@ -90,25 +90,25 @@ impl SweepAnalyzer {
         let is_elsewhere = known >= ENOUGH && elsewhere as f64 > self.settings.doubt * known as f64;
         let is_contradicted = is_elsewhere || self.is_angle_off();
         self.is_confirmed |= !is_contradicted && self.off.len() >= ENOUGH;
-        let is_doubted = is_contradicted || !self.is_confirmed;
-        let generation = self.forgotten as u32;
+        let is_unreliable = is_contradicted || !self.is_confirmed;
+        let generation = self.background_resets as u32;
         self.standing.clear();
-        if is_doubted {
+        if is_unreliable {
             self.points.iter_mut().for_each(|point| point.class = PointClass::Unknown);
-            self.doubted += 1;
+            self.unreliable += 1;
         } else {
             self.learn(sweep.number);
             self.pick();
-            self.doubted = 0;
+            self.unreliable = 0;
         }
-        if self.doubted > 2 * self.settings.sweeps {
+        if self.unreliable > 2 * self.settings.sweeps {
             self.model.forget();
-            self.forgotten += 1;
-            (self.doubted, self.is_confirmed) = (0, true);
+            self.background_resets += 1;
+            (self.unreliable, self.is_confirmed) = (0, true);
         }
-        let (obstacles, left_out) =
+        let (obstacles, dropped) =
             self.clusters.find(&self.standing, self.settings.cube_m as f32, self.settings.points);
-        Sweep { is_doubted, generation, points: &self.points, obstacles, left_out, ..sweep }
+        Sweep { is_unreliable, generation, points: &self.points, obstacles, dropped, ..sweep }
     }
 
     /// Computes the points of the rays. Returns the number of rays whose cell has a known background, and the number
@@ -250,9 +250,9 @@ impl Clusters {
             }
         }
         self.found.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
-        let left_out = self.found.len().saturating_sub(OBSTACLES) as u32;
+        let dropped = self.found.len().saturating_sub(OBSTACLES) as u32;
         self.found.truncate(OBSTACLES);
-        (&self.found, left_out)
+        (&self.found, dropped)
     }
 
     fn grown_from(&mut self, first: usize, points: &[Candidate]) -> Grown {
@@ -328,9 +328,9 @@ mod tests {
         let crate_ = (0..9).map(|i| ([1.0 + 0.1 * i as f32, -1.0, 0.3], Obstacle::NEAR));
         let speck = (0..3).map(|i| ([5.0, 5.0, 0.1 * i as f32], Obstacle::FOREGROUND));
         let mut clusters = Clusters::default();
-        let (found, left_out) =
+        let (found, dropped) =
             clusters.find(&pole.chain(crate_).chain(speck).map(candidate).collect::<Vec<_>>(), 0.15, 5);
-        assert_eq!((found.len(), left_out), (2, 0));
+        assert_eq!((found.len(), dropped), (2, 0));
         assert_eq!((found[0].points, found[0].flags), (9, Obstacle::NEAR), "the nearest first");
         assert!((found[0].distance_m - 2.0_f32.sqrt()).abs() < 1e-6);
         let pole = found[1];
@@ -370,10 +370,10 @@ mod tests {
             let points: Vec<[f32; 3]> =
                 (0..count).map(|_| std::array::from_fn(|_| 1.6 * random.f32() - 0.8)).collect();
             let flagged: Vec<_> = points.iter().map(|at| candidate((*at, 1))).collect();
-            let (found, left_out) = clusters.find(&flagged, 0.15, 2);
+            let (found, dropped) = clusters.find(&flagged, 0.15, 2);
             let mut sizes: Vec<usize> = found.iter().map(|obstacle| obstacle.points as usize).collect();
             sizes.sort_unstable();
-            assert_eq!((sizes, left_out), (slowly(&points, 0.15, 2), 0), "seed {seed}");
+            assert_eq!((sizes, dropped), (slowly(&points, 0.15, 2), 0), "seed {seed}");
         }
     }
 }

@@ -18,7 +18,7 @@ use serde::{Serialize, Serializer};
 
 use super::own_name;
 use super::results::{Results, Topics};
-use crate::tilt::{Angle, Check, Counts, Mount, Point, Settings, Sweep, TiltScanner, Withheld};
+use crate::tilt::{Angle, Check, Counts, DropReason, Mount, Point, Settings, Sweep, TiltScanner};
 
 /// 3D from a tilting scanner: points, background, obstacles
 #[derive(Args, Clone, Debug)]
@@ -220,7 +220,7 @@ impl TiltRun<'_> {
                 scanner.take_scan(header.stamp_first_ns, scan, &mut take);
                 writer.to_wall_ns = header.wall_ns.wrapping_sub(header.stamp_last_ns) as i64;
                 writer.results.take_flags(header);
-                if let Some(problem) = self.problem.changed(header.stamp_first_ns, scanner.trouble()) {
+                if let Some(problem) = self.problem.changed(header.stamp_first_ns, scanner.problem()) {
                     writer.write_angles(problem, scanner.late_ns(), None)?;
                 }
             }
@@ -258,14 +258,14 @@ impl TiltRun<'_> {
 /// Filters out short problems with the angles.
 #[derive(Default)]
 struct ProblemFilter {
-    reported: Option<Withheld>,
-    now: Option<Withheld>,
+    reported: Option<DropReason>,
+    now: Option<DropReason>,
     since_ns: u64,
 }
 
 impl ProblemFilter {
     /// Takes the problem at the time of a scan. Returns the problem, or its end, if it must be reported now.
-    fn changed(&mut self, stamp_ns: u64, now: Option<Withheld>) -> Option<Option<Withheld>> {
+    fn changed(&mut self, stamp_ns: u64, now: Option<DropReason>) -> Option<Option<DropReason>> {
         if now != self.now || self.since_ns == 0 {
             (self.now, self.since_ns) = (now, stamp_ns);
         }
@@ -302,11 +302,11 @@ impl SweepWriter<'_> {
     /// Stores the obstacles of a sweep, and publishes the sweep if topics exist. Returns the header of the obstacles.
     fn publish(&mut self, sweep: &Sweep<'_>) -> Header {
         let flags = if sweep.is_complete { Obstacles::COMPLETE } else { 0 }
-            | if sweep.is_doubted { Obstacles::DOUBTED } else { 0 };
+            | if sweep.is_unreliable { Obstacles::UNRELIABLE } else { 0 };
         *self.obstacles = Obstacles {
             sweep: sweep.number,
             generation: sweep.generation,
-            left_out: sweep.left_out,
+            dropped: sweep.dropped,
             flags,
             ..Obstacles::default()
         };
@@ -362,11 +362,11 @@ impl SweepWriter<'_> {
     /// Reports a problem with the angles, its end, or with `mount` a new delay of their stamps.
     fn write_angles(
         &mut self,
-        trouble: Option<Withheld>,
+        problem: Option<DropReason>,
         late_ns: i64,
         mount: Option<&str>,
     ) -> Result<(), End> {
-        let line = Line::Angles { sensor: self.results.name, trouble, late_ns, mount };
+        let line = Line::Angles { sensor: self.results.name, problem, late_ns, mount };
         self.results.note(&line, |out| line.text(out))
     }
 }
@@ -382,7 +382,7 @@ fn scans(points: &[Point], most: usize) -> impl Iterator<Item = &[Point]> {
 enum Line<'a> {
     Angles {
         sensor: &'a str,
-        trouble: Option<Withheld>,
+        problem: Option<DropReason>,
         #[serde(rename = "late_ms", serialize_with = "milliseconds")]
         late_ns: i64,
         /// Name of the mount if the line reports a new delay.
@@ -411,18 +411,18 @@ impl Line<'_> {
                  its measurement",
                 lateness(*late_ns)
             ),
-            Line::Angles { trouble, .. } => {
-                let text = match trouble {
+            Line::Angles { problem, .. } => {
+                let text = match problem {
                     None => "the angles are well again",
-                    Some(Withheld::Silent) => {
+                    Some(DropReason::Silent) => {
                         "no points: no angles come, or too late; is the program that publishes them running, and its clock \
                          right?"
                     }
-                    Some(Withheld::Jumped) => "no points: the angles have jumped",
-                    Some(Withheld::Inconsistent) => {
+                    Some(DropReason::Jumped) => "no points: the angles have jumped",
+                    Some(DropReason::Inconsistent) => {
                         "no points: the angles are not those that their rates say"
                     }
-                    Some(Withheld::Standing) => "no points: the mount stands, or its encoder hangs",
+                    Some(DropReason::Standing) => "no points: the mount stands, or its encoder hangs",
                 };
                 out.write_all(text.as_bytes())
             }
@@ -431,18 +431,18 @@ impl Line<'_> {
                 if remedy.is_empty() { Ok(()) } else { write!(out, "; {remedy}") }
             }
             Line::Summary { counts, missed, failed, late_ns, .. } => {
-                let Counts { sweeps, incomplete, doubted, scans, points, angles, .. } = counts;
+                let Counts { sweeps, incomplete, unreliable, scans, points, angles, .. } = counts;
                 write!(
                     out,
-                    "{sweeps} sweeps ({incomplete} incomplete, {doubted} doubted) of {scans} scans, "
+                    "{sweeps} sweeps ({incomplete} incomplete, {unreliable} unreliable) of {scans} scans, "
                 )?;
-                let [silent, jumped, inconsistent, standing] = counts.withheld;
-                write!(out, "{points} points; withheld: {silent} without an angle, {jumped} jumped, ")?;
-                write!(out, "{inconsistent} inconsistent, {standing} standing; {angles} angles; left out: ")?;
-                let Counts { angles_unordered, angles_ahead, angles_unfit, .. } = counts;
+                let [silent, jumped, inconsistent, standing] = counts.points_dropped;
+                write!(out, "{points} points; points_dropped: {silent} without an angle, {jumped} jumped, ")?;
+                write!(out, "{inconsistent} inconsistent, {standing} standing; {angles} angles; dropped: ")?;
+                let Counts { angles_out_of_order, angles_in_future, angles_invalid, .. } = counts;
                 write!(
                     out,
-                    "{angles_unordered} late, {angles_ahead} ahead, {angles_unfit} unfit, {missed} missed"
+                    "{angles_out_of_order} late, {angles_in_future} in the future, {angles_invalid} invalid, {missed} missed"
                 )?;
                 if *late_ns != 0 {
                     write!(out, "; stamps of angles {}, corrected", lateness(*late_ns))?;
@@ -595,7 +595,7 @@ mod tests {
     fn short_problems_are_not_reported() {
         const MS: u64 = 1_000_000;
         let mut problem = ProblemFilter::default();
-        let (well, silent, jumped) = (None, Some(Withheld::Silent), Some(Withheld::Jumped));
+        let (well, silent, jumped) = (None, Some(DropReason::Silent), Some(DropReason::Jumped));
         // At the start no angle has come yet.
         assert_eq!(problem.changed(1000 * MS, silent), None);
         assert_eq!(problem.changed(1027 * MS, well), None);

@@ -293,7 +293,7 @@ impl PictureWriter<'_> {
         let doors = self.site.doors.iter().zip(&self.passed);
         let line = Line::Summary {
             sensor: self.results.name,
-            pictures: self.samples[0],
+            samples: self.samples[0],
             appeared: self.appeared,
             doors: doors.map(|(door, &passed)| Passed::of(&door.name, passed)).collect(),
             counts,
@@ -334,7 +334,7 @@ enum Line<'a> {
     },
     Summary {
         sensor: &'a str,
-        pictures: u64,
+        samples: u64,
         appeared: u64,
         doors: Vec<Passed<'a>>,
         #[serde(flatten)]
@@ -380,13 +380,13 @@ impl Line<'_> {
                 write!(out, ": set --delay longer than {delay:?}")
             }
             Line::Summary { appeared, doors, counts, missed, failed, .. } => {
-                let Counts { scans, late, jumped, unfit } = counts;
+                let Counts { scans, late, jumped, invalid } = counts;
                 write!(out, "{appeared} people appeared in {scans} scans")?;
                 for door in doors {
                     write!(out, "; ")?;
                     door.text(out)?;
                 }
-                write!(out, "; left out: {late} late, {jumped} jumped, {unfit} unfit, {missed} missed")?;
+                write!(out, "; dropped: {late} late, {jumped} jumped, {invalid} invalid, {missed} missed")?;
                 if *failed > 0 { write!(out, "; {failed} not published: no memory") } else { Ok(()) }
             }
         }

@@ -93,6 +93,6 @@ fn each_point_is_where_all_angles_together_say() {
         }
         // The last sweep is not over.
         assert!(made > 4 * 13_000 && made <= expected.len(), "seed {seed}: {made} of {}", expected.len());
-        assert_eq!((tilting.counts().withheld, tilting.trouble()), ([0; 4], None), "seed {seed}");
+        assert_eq!((tilting.counts().points_dropped, tilting.problem()), ([0; 4], None), "seed {seed}");
     }
 }

@@ -14,7 +14,7 @@ mod judge;
 
 use hall::Hall;
 use judge::{Score, Seen, seconds};
-use scanhub_perception::tilt::{Settings, Withheld};
+use scanhub_perception::tilt::{DropReason, Settings};
 use scanhub_sim::mount::{Fault, FaultKind};
 use scanhub_sim::world::World;
 
@@ -31,7 +31,11 @@ fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
             score.add(hall, sweep, &settings, judge::SWEEP_NS);
         }
     });
-    assert_eq!(counts.withheld.iter().sum::<u64>() + counts.doubted + counts.forgotten, 0, "{counts:?}");
+    assert_eq!(
+        counts.points_dropped.iter().sum::<u64>() + counts.unreliable + counts.background_resets,
+        0,
+        "{counts:?}"
+    );
     assert!(seen.is_pole_found_at_once(), "{seen:?}");
     assert!(seen.sweeps_of_pole() >= 4 && seen.sweeps_of_pole() <= 7, "{seen:?}");
     assert!(seen.sweeps_of_box() >= 4 && seen.sweeps_of_box() <= 7, "{seen:?}");
@@ -39,9 +43,9 @@ fn people_a_pole_and_a_box_are_found_and_melt_into_the_background() {
     assert!(score.recall() > 0.95 && score.precision() > 0.97, "{score:?}");
 }
 
-/// What a fault from 7 to 10 s makes of a room in which nothing is new: what was withheld by reason, and doubted. No obstacle
+/// What a fault from 7 to 10 s makes of a room in which nothing is new: what was points_dropped by reason, and unreliable. No obstacle
 /// is invented, no point that is handed out for good is wrong, and afterwards all is as before.
-fn of(kind: FaultKind) -> ([u64; Withheld::COUNT], u64) {
+fn of(kind: FaultKind) -> ([u64; DropReason::COUNT], u64) {
     let room = "[[thing]]\nline = [[-2500, -1000], [2500, -1000], [2500, 4000], [-2500, 4000], [-2500, -1000]]\n\
                 [[thing]]\nbox = [600, 400]\nheight_mm = 350\npose = [-900, 2200, 35]\n";
     let mount = "[sensor.mount]\nheight_mm = 900\narm_mm = [60, 40]\nfrom_deg = 0\nto_deg = 30\n";
@@ -55,58 +59,58 @@ fn of(kind: FaultKind) -> ([u64; Withheld::COUNT], u64) {
     let counts = hall.play(settings, 17, |hall, sweep| {
         let wrong = sweep.points.iter().map(|point| hall.error_m(point)).fold(0.0, f64::max);
         let [from, until] = [sweep.from_ns, sweep.until_ns].map(|ns| ns as f64 / 1e9);
-        assert!(sweep.is_doubted || wrong < 0.03, "{kind:?}, {from} to {until} s: {wrong} m");
+        assert!(sweep.is_unreliable || wrong < 0.03, "{kind:?}, {from} to {until} s: {wrong} m");
         assert!(sweep.obstacles.is_empty(), "{kind:?}, {from} to {until} s: {:?}", sweep.obstacles);
-        healthy += u32::from(from > 11.5 && sweep.is_complete && !sweep.is_doubted);
+        healthy += u32::from(from > 11.5 && sweep.is_complete && !sweep.is_unreliable);
     });
     assert!(healthy >= 4, "{kind:?}: {healthy}, {counts:?}");
     assert_eq!(hall.late_ns, 0, "{kind:?}: the stamps were right");
-    (counts.withheld, counts.doubted)
+    (counts.points_dropped, counts.unreliable)
 }
 
 #[test]
 fn a_mount_that_halts_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Halts);
-    assert_eq!([silent, jumped, inconsistent, doubted], [0; 4]);
+    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Halts);
+    assert_eq!([silent, jumped, inconsistent, unreliable], [0; 4]);
     // As long as it stands, and no longer.
     assert!((35_000..42_000).contains(&standing), "{standing}");
 }
 
 #[test]
 fn an_encoder_that_hangs_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Stuck);
-    assert_eq!([silent, inconsistent, doubted], [0; 3]);
+    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Stuck);
+    assert_eq!([silent, inconsistent, unreliable], [0; 3]);
     assert!(standing > 30_000 && jumped > 0, "{standing} {jumped}");
 }
 
 #[test]
 fn a_silent_encoder_is_told_and_makes_no_points() {
-    let ([silent, jumped, inconsistent, standing], doubted) = of(FaultKind::Silent);
-    assert_eq!([jumped, inconsistent, standing, doubted], [0; 4]);
+    let ([silent, jumped, inconsistent, standing], unreliable) = of(FaultKind::Silent);
+    assert_eq!([jumped, inconsistent, standing, unreliable], [0; 4]);
     assert!((35_000..42_000).contains(&silent), "{silent}");
 }
 
 #[test]
-fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_doubted() {
+fn an_encoder_that_jumps_is_told_and_what_it_says_then_is_unreliable() {
     for by_deg in [8.0, -3.0] {
-        let ([_, jumped, ..], doubted) = of(FaultKind::Jumps(by_deg));
-        assert!(jumped > 5_000 && doubted > 0, "{by_deg}: {jumped} {doubted}");
+        let ([_, jumped, ..], unreliable) = of(FaultKind::Jumps(by_deg));
+        assert!(jumped > 5_000 && unreliable > 0, "{by_deg}: {jumped} {unreliable}");
     }
 }
 
 #[test]
-fn an_encoder_that_lies_is_doubted() {
+fn an_encoder_that_lies_is_unreliable() {
     for by_deg in [4.0, -2.0] {
-        let (withheld, doubted) = of(FaultKind::Lies(by_deg));
-        assert!(doubted >= 3, "{by_deg}: {withheld:?} {doubted}");
+        let (points_dropped, unreliable) = of(FaultKind::Lies(by_deg));
+        assert!(unreliable >= 3, "{by_deg}: {points_dropped:?} {unreliable}");
     }
 }
 
 #[test]
 fn angles_that_come_late_are_waited_for_but_not_for_ever() {
-    let ([silent, others @ ..], doubted) = of(FaultKind::Late(0.2));
+    let ([silent, others @ ..], unreliable) = of(FaultKind::Late(0.2));
     // When they come in time again, the last late ones come after them.
-    assert!(silent < 4_000 && others == [0; 3] && doubted == 0, "{silent} {others:?} {doubted}");
+    assert!(silent < 4_000 && others == [0; 3] && unreliable == 0, "{silent} {others:?} {unreliable}");
     let ([silent, ..], _) = of(FaultKind::Late(1.0));
     assert!(silent > 20_000, "{silent}");
 }
@@ -127,7 +131,11 @@ fn stamps_that_are_late_from_the_start_are_found_and_corrected() {
         });
         assert!((hall.late_ns as f64 / 1e9 - by_s).abs() < 0.001, "{by_s} s: {} ns", hall.late_ns);
         assert!(sweeps > 1 && most < 0.02, "{by_s} s: {most} m in {sweeps} sweeps");
-        assert_eq!((counts.forgotten, counts.doubted), (1, 0), "{by_s} s: what was learned until then");
+        assert_eq!(
+            (counts.background_resets, counts.unreliable),
+            (1, 0),
+            "{by_s} s: what was learned until then"
+        );
     }
 }
 
@@ -141,10 +149,13 @@ fn stamps_that_get_late_are_corrected_and_the_background_stays() {
         let is_known =
             sweep.points.iter().any(|point| point.class == scanhub_perception::tilt::PointClass::Background);
         known += u32::from(sweep.from_ns > seconds(30) && is_known);
-        assert!(sweep.is_doubted || sweep.obstacles.is_empty(), "{:?}", sweep.obstacles);
+        assert!(sweep.is_unreliable || sweep.obstacles.is_empty(), "{:?}", sweep.obstacles);
     });
     assert!((hall.late_ns as f64 / 1e6 - 30.0).abs() < 1.0, "{} ns", hall.late_ns);
-    assert!((1..=5).contains(&counts.doubted) && counts.forgotten == 0 && known > 2, "{counts:?} {known}");
+    assert!(
+        (1..=5).contains(&counts.unreliable) && counts.background_resets == 0 && known > 2,
+        "{counts:?} {known}"
+    );
 }
 
 #[test]

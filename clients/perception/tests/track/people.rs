@@ -111,14 +111,14 @@ fn latecomers_and_clocks_that_jump_are_counted_and_change_nothing() {
     }
     people.finish(|picture| shown.push(picture.clone()));
     let counts = people.counts();
-    assert_eq!((counts.late, counts.jumped, counts.unfit), (9, 9, 0));
+    assert_eq!((counts.late, counts.jumped, counts.invalid), (9, 9, 0));
     // Sensors send in turn, so that every 200th scan comes from the first one.
     assert_eq!(people.late(), [9, 0, 0, 0]);
     assert!(in_order == shown);
     let other = Foreground::of(181);
     people.take(0, BEGIN_NS, &sent[0].scan, &other, |_| {});
     people.take(9, BEGIN_NS, &sent[0].scan, &sent[0].foreground, |_| {});
-    assert_eq!(people.counts().unfit, 2);
+    assert_eq!(people.counts().invalid, 2);
 }
 
 #[test]

@@ -78,7 +78,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         yaw_deg: Option<f64>,
         valid: bool,
         degenerate: bool,
-        breaks: u16,
+        refused_steps: u16,
         pose_covariance: Option<[f32; 9]>,
         #[serde(flatten)]
         flags: Words,
@@ -98,7 +98,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         yaw_deg: motion.has_pose().then(|| in_degrees(motion.yaw_rad)),
         valid: motion.has_valid_pose(),
         degenerate: motion.is_degenerate(),
-        breaks: motion.breaks,
+        refused_steps: motion.refused_steps,
         pose_covariance: motion.sum_covariance().copied(),
         flags: Words::of(header),
     }
@@ -218,7 +218,7 @@ pub(crate) fn foreground<'a>(
         ranges: &'a [u16],
         #[serde(serialize_with = "segment_list")]
         segments: &'a Foreground,
-        left_out: u16,
+        dropped: u16,
         #[serde(flatten)]
         flags: Words,
     }
@@ -229,7 +229,7 @@ pub(crate) fn foreground<'a>(
         beams: foreground,
         ranges: foreground.ranges(),
         segments: foreground,
-        left_out: foreground.left_out,
+        dropped: foreground.dropped,
         flags: Words::of(header),
     }
 }
@@ -469,7 +469,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
         first: bool,
         last: bool,
         complete: bool,
-        doubted: bool,
+        unreliable: bool,
         #[serde(serialize_with = "point_list")]
         points: &'a Cloud,
         #[serde(serialize_with = "beam_list")]
@@ -486,7 +486,7 @@ pub(crate) fn cloud<'a>(sensor: &'a str, header: &Header, cloud: &'a Cloud) -> i
         first: cloud.has(Cloud::FIRST),
         last: cloud.has(Cloud::LAST),
         complete: cloud.has(Cloud::COMPLETE),
-        doubted: cloud.has(Cloud::DOUBTED),
+        unreliable: cloud.has(Cloud::UNRELIABLE),
         points: cloud,
         beams: cloud,
         classes: cloud,
@@ -503,10 +503,10 @@ pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> 
         sweep: u32,
         generation: u32,
         complete: bool,
-        doubted: bool,
+        unreliable: bool,
         #[serde(serialize_with = "obstacle_list")]
         obstacles: &'a Obstacles,
-        left_out: u32,
+        dropped: u32,
         #[serde(flatten)]
         flags: Words,
     }
@@ -515,9 +515,9 @@ pub fn obstacles<'a>(sensor: &'a str, header: &Header, found: &'a Obstacles) -> 
         sweep: found.sweep,
         generation: found.generation,
         complete: found.has(Obstacles::COMPLETE),
-        doubted: found.has(Obstacles::DOUBTED),
+        unreliable: found.has(Obstacles::UNRELIABLE),
         obstacles: found,
-        left_out: found.left_out,
+        dropped: found.dropped,
         flags: Words::of(header),
     }
 }
@@ -638,7 +638,7 @@ mod tests {
         let head = CloudHead { sweep: 3, generation: 1, flags, ..CloudHead::default() };
         // A class that is not known says nothing.
         let line = letters(cloud("house", &header(), &Cloud::of(head, &[point(90, 2), point(91, 9)])));
-        let rest = r#""sweep":3,"generation":1,"first":true,"last":false,"complete":true,"doubted":false,"points":[[1.0,-2.5,0.123],[1.0,-2.5,0.123]],"beams":[90,91],"classes":[2,0]}"#;
+        let rest = r#""sweep":3,"generation":1,"first":true,"last":false,"complete":true,"unreliable":false,"points":[[1.0,-2.5,0.123],[1.0,-2.5,0.123]],"beams":[90,91],"classes":[2,0]}"#;
         assert_eq!(line, format!(r#"{{"class":"cloud",{HEAD}{rest}"#));
     }
 
@@ -657,7 +657,7 @@ mod tests {
         let line = letters(obstacles("house", &header(), &found));
         let one = r#"{"x_m":2.0,"y_m":0.0,"z_m":0.5,"low_m":[1.95,-0.05,0.0],"high_m":[2.05,0.05,1.0],"distance_m":1.95,"points":120,"foreground":true,"near":false}"#;
         let rest = format!(
-            r#""sweep":3,"generation":0,"complete":true,"doubted":false,"obstacles":[{one}],"left_out":0}}"#
+            r#""sweep":3,"generation":0,"complete":true,"unreliable":false,"obstacles":[{one}],"dropped":0}}"#
         );
         assert_eq!(line, format!(r#"{{"class":"obstacles",{HEAD}{rest}"#));
     }

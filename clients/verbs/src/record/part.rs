@@ -297,8 +297,8 @@ impl Part {
     fn gap(&mut self, gap: &Gap) -> io::Result<()> {
         let span = [("from_ns", gap.from_ns), ("to_ns", gap.to_ns)];
         let facts = span.map(|(key, value)| (key.to_owned(), value.to_string()));
-        let left_out = gap.left_out.iter().map(|(name, count)| (name.to_string(), count.to_string()));
-        self.writer()?.note(GAP, facts.into_iter().chain(left_out).collect())
+        let dropped = gap.dropped.iter().map(|(name, count)| (name.to_string(), count.to_string()));
+        self.writer()?.note(GAP, facts.into_iter().chain(dropped).collect())
     }
 }
 

@@ -46,7 +46,7 @@ pub(super) struct Gap {
     pub(super) from_ns: u64,
     pub(super) to_ns: u64,
     /// Number of samples by topic.
-    pub(super) left_out: Vec<(TopicName, u64)>,
+    pub(super) dropped: Vec<(TopicName, u64)>,
 }
 
 impl Queue {

@@ -166,22 +166,22 @@ impl<'a> Report<'a> {
     /// Reports that samples are left out from now on.
     pub(super) fn gap_begins(&mut self) -> Result<(), End> {
         if self.look == Look::Json {
-            let (left_out, seconds) = (0, 0.0);
-            return self.out.json(&Left { class: "notice", kind: "gap_begins", left_out, seconds });
+            let (dropped, seconds) = (0, 0.0);
+            return self.out.json(&Left { class: "notice", kind: "gap_begins", dropped, seconds });
         }
         self.note(|line| write!(line, "memory for samples is full: samples are left out of the recording"))
     }
 
     /// Reports what a gap left out.
     pub(super) fn gap_ends(&mut self, gap: &Gap) -> Result<(), End> {
-        let left_out = gap.left_out.iter().map(|(_, count)| count).sum();
+        let dropped = gap.dropped.iter().map(|(_, count)| count).sum();
         let seconds = gap.to_ns.saturating_sub(gap.from_ns) as f64 / 1e9;
         if self.look == Look::Json {
-            return self.out.json(&Left { class: "notice", kind: "gap_ends", left_out, seconds });
+            return self.out.json(&Left { class: "notice", kind: "gap_ends", dropped, seconds });
         }
         self.note(|line| {
-            write!(line, "records again: {left_out} samples of {seconds:.1} s are not in the recording (")?;
-            for (at, (name, count)) in gap.left_out.iter().enumerate() {
+            write!(line, "records again: {dropped} samples of {seconds:.1} s are not in the recording (")?;
+            for (at, (name, count)) in gap.dropped.iter().enumerate() {
                 write!(line, "{}{name} {count}", if at == 0 { "" } else { ", " })?;
             }
             write!(line, ")")
@@ -189,7 +189,7 @@ impl<'a> Report<'a> {
     }
 
     /// Reports the progress once a second, to a terminal or as JSON.
-    pub(super) fn progress(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
+    pub(super) fn progress(&mut self, written: &RecordStats, dropped: u64) -> Result<(), End> {
         if Instant::now() < self.next {
             return Ok(());
         }
@@ -197,13 +197,13 @@ impl<'a> Report<'a> {
         match self.look {
             Look::Lines => Ok(()),
             Look::Json => {
-                let progress = self.at(written, left_out);
+                let progress = self.at(written, dropped);
                 self.out.json(&progress)
             }
             Look::Terminal => {
                 // A line that wraps could not be redrawn, so the terminal cuts a line that is still too long.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
-                let status = fitting(self.status(written, left_out), columns);
+                let status = fitting(self.status(written, dropped), columns);
                 let line = [WIPE, b"\x1b[?7l", status.as_bytes(), b"\x1b[?7h"].concat();
                 self.bytes = written.bytes;
                 self.out.raw(&line)
@@ -221,7 +221,7 @@ impl<'a> Report<'a> {
     }
 
     /// Reports the finished recording.
-    pub(super) fn end(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
+    pub(super) fn end(&mut self, written: &RecordStats, dropped: u64) -> Result<(), End> {
         let RecordStats { bytes, samples, .. } = *written;
         if self.look == Look::Json {
             return self.out.json(&Recorded {
@@ -230,7 +230,7 @@ impl<'a> Report<'a> {
                 bytes,
                 samples,
                 lost: self.lost,
-                left_out,
+                dropped,
                 gone: self.gone,
                 seconds: self.begun.elapsed().as_secs_f64(),
             });
@@ -247,28 +247,28 @@ impl<'a> Report<'a> {
                 [] => {}
             }
             write!(line, ": {samples} samples, {}", size(bytes))?;
-            if left_out > 0 {
-                write!(line, ", {left_out} left out")?;
+            if dropped > 0 {
+                write!(line, ", {dropped} dropped")?;
             }
             if gone > 0 { write!(line, ", {gone} gone with files that were removed or cut") } else { Ok(()) }
         })
     }
 
-    fn at(&self, written: &RecordStats, left_out: u64) -> Progress {
+    fn at(&self, written: &RecordStats, dropped: u64) -> Progress {
         Progress {
             class: "recording",
             file: self.files.last().map(|file| file.display().to_string()),
             bytes: written.bytes,
             samples: written.samples,
             lost: self.lost,
-            left_out,
+            dropped,
             seconds: self.begun.elapsed().as_secs_f64(),
             older_removed: None,
         }
     }
 
     /// Returns the progress in parts with their ranks. Lost samples have the highest rank.
-    fn status(&self, written: &RecordStats, left_out: u64) -> Vec<(u8, String)> {
+    fn status(&self, written: &RecordStats, dropped: u64) -> Vec<(u8, String)> {
         let seconds = self.begun.elapsed().as_secs();
         let rate = written.bytes.saturating_sub(self.bytes) / EVERY.as_secs();
         let trouble = self.is_in_trouble.then(|| (4, "disk trouble".to_owned()));
@@ -277,7 +277,7 @@ impl<'a> Report<'a> {
             (1, size(written.bytes)),
             (0, format!("{}/s", size(rate))),
             (2, format!("{} samples", written.samples)),
-            (5, format!("{} lost", self.lost + left_out + self.gone)),
+            (5, format!("{} lost", self.lost + dropped + self.gone)),
         ];
         trouble.into_iter().chain(parts).collect()
     }
@@ -313,7 +313,7 @@ struct Progress {
     bytes: u64,
     samples: u64,
     lost: u64,
-    left_out: u64,
+    dropped: u64,
     seconds: f64,
     /// Only in the first line.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -328,7 +328,7 @@ struct Recorded {
     bytes: u64,
     samples: u64,
     lost: u64,
-    left_out: u64,
+    dropped: u64,
     gone: u64,
     seconds: f64,
 }
@@ -352,7 +352,7 @@ struct Disk<'a> {
 struct Left {
     class: &'static str,
     kind: &'static str,
-    left_out: u64,
+    dropped: u64,
     seconds: f64,
 }
 

@@ -67,8 +67,8 @@ fn obey(
     let generation = model.generation + 1;
     match (verb, wanted) {
         (Verb::Reset, _) => {
-            model.ranges_mut().fill(Background::UNTAUGHT);
-            (model.generation, model.taught) = (generation, 0);
+            model.ranges_mut().fill(Background::UNKNOWN);
+            (model.generation, model.known_beams) = (generation, 0);
         }
         (Verb::Freeze, _) => model.flags = Background::FROZEN,
         (Verb::Thaw, _) => model.flags = 0,
@@ -94,11 +94,11 @@ fn of_beams(count: usize, step_deg: f64) -> Box<Background> {
         first_angle: (-90_f64).to_radians(),
         step: step_deg.to_radians(),
         generation: 4,
-        taught: 3,
+        known_beams: 3,
         unit_um: 10_000,
         ..BackgroundHead::default()
     };
-    let mut model = Background::of(head, &vec![Background::UNTAUGHT; count]);
+    let mut model = Background::of(head, &vec![Background::UNKNOWN; count]);
     model.ranges_mut()[..4].copy_from_slice(&[400, 0, Background::FAR, 120]);
     model
 }
@@ -144,7 +144,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     assert_eq!(end, Ok(()));
     assert_eq!(
         out.split_at(160).0,
-        r#"{"class":"background","sensor":"front","generation":6,"taught":3,"unit_mm":10,"count":181,"first_angle_deg":-90.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,"#
+        r#"{"class":"background","sensor":"front","generation":6,"known_beams":3,"unit_mm":10,"count":181,"first_angle_deg":-90.0,"step_deg":1.0,"frozen":false,"ranges":[400,null,"#
             .split_at(160)
             .0
     );
@@ -156,7 +156,7 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     assert_eq!(
         out,
         format!(
-            "{{\"class\":\"saved\",\"sensor\":\"front\",\"file\":{:?},\"generation\":6,\"taught\":3,\"count\":181}}\n",
+            "{{\"class\":\"saved\",\"sensor\":\"front\",\"file\":{:?},\"generation\":6,\"known_beams\":3,\"count\":181}}\n",
             file.display().to_string()
         )
     );
@@ -262,7 +262,7 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
         assert_eq!(failure.message, "the background of front has no known beam yet");
         assert_eq!((failure.kind, out.as_str()), (Kind::Failed, ""));
     }
-    assert_eq!(saved_model(&file, "front", false, &mut &b""[..]).unwrap().taught, 3);
+    assert_eq!(saved_model(&file, "front", false, &mut &b""[..]).unwrap().known_beams, 3);
 }
 
 #[test]

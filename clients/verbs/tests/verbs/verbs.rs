@@ -61,7 +61,7 @@ fn topics_of_a_hub() {
     let (_, out, _) = verb.join();
     assert_eq!(
         out.lines().nth(2),
-        Some("front/scan        37.54          0  scanhub.Scan.v2               1"),
+        Some("front/scan        37.54            0  scanhub.Scan.v2               1"),
         "{out}"
     );
 }

@@ -157,7 +157,7 @@ impl Sensor {
     /// Returns the points of the background, in meters in the frame of the picture.
     pub fn background_points(&self) -> Vec<(f64, f64)> {
         let (Some(pose), Some(model)) = (self.placement.pose(), &self.background) else { return Vec::new() };
-        let has_point = |range: &&u16| ![Background::UNTAUGHT, Background::FAR].contains(range);
+        let has_point = |range: &&u16| ![Background::UNKNOWN, Background::FAR].contains(range);
         let ranges = model.ranges().iter().enumerate().filter(|(_, range)| has_point(range));
         let points = ranges.map(|(i, range)| {
             let angle = model.first_angle + i as f64 * model.step;

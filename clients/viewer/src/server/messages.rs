@@ -140,7 +140,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         frozen: bool,
         simulated: bool,
         replayed: bool,
-        taught: Option<u32>,
+        known_beams: Option<u32>,
         objects: Option<usize>,
         marks: Option<usize>,
         verdict: &'a str,
@@ -182,7 +182,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
         frozen: sensor.is_frozen(),
         simulated: sensor.is_simulated(),
         replayed: sensor.is_replayed(),
-        taught: sensor.background.as_ref().map(|model| u32::from(model.taught)),
+        known_beams: sensor.background.as_ref().map(|model| u32::from(model.known_beams)),
         objects: sensor.foreground.as_ref().map(|foreground| foreground.segments().len()),
         marks: sensor.marks.map(|marks| marks.marks().len()),
         verdict: sensor.zones.verdict().name(),
@@ -194,7 +194,7 @@ pub(crate) fn status(sensor: &Sensor) -> Vec<u8> {
 /// Encodes the background of `sensor` as a scan: NaN where it is unknown, +inf where it is out of range.
 pub(crate) fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Background) {
     let as_scan = |range: &u16| match *range {
-        Background::UNTAUGHT => Scan::NOT_MEASURED,
+        Background::UNKNOWN => Scan::NOT_MEASURED,
         Background::FAR => BEYOND,
         range => range.min(BEYOND - 1),
     };
@@ -291,7 +291,7 @@ mod tests {
     fn background_is_encoded_as_a_scan() {
         let head =
             BackgroundHead { first_angle: -1.0, step: 0.5, unit_um: 1000, ..BackgroundHead::default() };
-        let model = Background::of(head, &[4000, Background::UNTAUGHT, Background::FAR]);
+        let model = Background::of(head, &[4000, Background::UNKNOWN, Background::FAR]);
         let mut message = Vec::new();
         background(&mut message, "front", 7, &model);
         let told = read(&LASER_SCAN, &message).unwrap();

@@ -152,7 +152,7 @@ fn line(number: usize, sensor: &Sensor, view: &View, width: u16) -> Line<'static
         }
         fields.push(format!("  suspect {}", sensor.count(Counter::Suspect)));
         if width >= WIDE {
-            let known_beams = sensor.background.as_ref().map_or(0, |model| model.taught);
+            let known_beams = sensor.background.as_ref().map_or(0, |model| model.known_beams);
             let marks = sensor.marks.map(|marks| marks.marks().len().to_string());
             let objects =
                 sensor.foreground.as_ref().map(|foreground| foreground.segments().len().to_string());

@@ -49,7 +49,7 @@ fn see(sensor: &mut Sensor, pose: Pose) {
         first_angle,
         step,
         unit_um,
-        taught: 361,
+        known_beams: 361,
         generation: 1,
         ..BackgroundHead::default()
     };

@@ -105,7 +105,7 @@ impl<'a> RawScan<'a> {
             }
             Values::Points { points, .. } => {
                 let collisions = Grid::new(self.beams()).fill(points, ranges, upper, angles);
-                scan.collapsed = u16::try_from(collisions).unwrap_or(u16::MAX);
+                scan.collisions = u16::try_from(collisions).unwrap_or(u16::MAX);
             }
         }
     }
@@ -245,7 +245,7 @@ mod tests {
         let mut scan = Scan::zeroed(raw.payload_len());
         raw.write(&mut scan);
         assert_eq!(raw.payload_len(), Scan::len(8, Contents::TURNING));
-        assert_eq!((scan.beams(), scan.collapsed, scan.is_incomplete()), (8, 1, true));
+        assert_eq!((scan.beams(), scan.collisions, scan.is_incomplete()), (8, 1, true));
         assert_eq!(
             (scan.distance_mm(0), scan.distance_mm(2), scan.intensities().get(2)),
             (Some(1000), Some(500), Some(9))

@@ -12,7 +12,7 @@ use scanhub_schema::Background;
 /// times in a row. A beam that flips between two surfaces never learns either of them.
 #[derive(Clone)]
 pub(super) struct Paper {
-    /// Ranges in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
+    /// Ranges in device units, [`Background::UNKNOWN`] or [`Background::FAR`].
     background: Box<[u16]>,
     /// Candidates for the background, where `run` is not 0.
     candidate: Box<[u16]>,
@@ -24,12 +24,12 @@ impl Paper {
     /// Creates the state for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Paper {
         let none = || vec![0; beams].into_boxed_slice();
-        Paper { background: vec![Background::UNTAUGHT; beams].into(), candidate: none(), run: none() }
+        Paper { background: vec![Background::UNKNOWN; beams].into(), candidate: none(), run: none() }
     }
 
     /// Restores the initial state.
     pub(super) fn forget(&mut self) {
-        self.background.fill(Background::UNTAUGHT);
+        self.background.fill(Background::UNKNOWN);
         self.run.fill(0);
     }
 
@@ -40,7 +40,7 @@ impl Paper {
             let aside = if reading < background { Class::Foreground } else { Class::Behind };
             let ends = reading.abs_diff(background) <= limits.threshold;
             let known = if ends { Class::Background } else { aside };
-            let valid = if background == Background::UNTAUGHT { Class::Unknown } else { known };
+            let valid = if background == Background::UNKNOWN { Class::Unknown } else { known };
             *class = if reading == INVALID { Class::Invalid } else { valid };
         }
         if learn {
@@ -55,7 +55,7 @@ impl Paper {
         let run = &mut self.run[..beams];
         for (i, &reading) in readings.iter().enumerate() {
             let valid = reading != INVALID;
-            let known = background[i] != Background::UNTAUGHT;
+            let known = background[i] != Background::UNKNOWN;
             let ends = known & (reading.abs_diff(background[i]) <= limits.threshold);
             let goes_on = (run[i] > 0) & (reading.abs_diff(candidate[i]) <= limits.candidate);
             let longer = if goes_on { run[i] + 1 } else { 1 };
@@ -212,7 +212,7 @@ impl Multi {
         let known = |&(_, weight): &(u16, i16)| weight >= Bounds::of(limits).known;
         let rank = |&(range, weight): &(u16, i16)| (range != Background::FAR, weight, u16::MAX - range);
         let best = self.surfaces(i).filter(known).max_by_key(rank);
-        best.map_or(Background::UNTAUGHT, |(range, _)| range)
+        best.map_or(Background::UNKNOWN, |(range, _)| range)
     }
 }
 

@@ -259,7 +259,7 @@ impl Moving {
 
     /// Returns the range of beam `i` without a foreground, in device units.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
-        let Some(place) = self.place.filter(|place| place.unit_m > 0.0) else { return Background::UNTAUGHT };
+        let Some(place) = self.place.filter(|place| place.unit_m > 0.0) else { return Background::UNKNOWN };
         let along = place.along(place.angles.0 + i as f64 * place.angles.1);
         for step in 1..WIDTH / 2 {
             let range = f64::from(step) * CELL_M;
@@ -272,7 +272,7 @@ impl Moving {
                 return (range / place.unit_m).min(f64::from(INVALID - 1)) as u16;
             }
         }
-        Background::UNTAUGHT
+        Background::UNKNOWN
     }
 }
 

@@ -110,7 +110,7 @@ pub(crate) fn any_model(random: &mut fastrand::Rng, shape: Shape) -> Box<Backgro
     let mut model = Background::of(head, &vec![0; shape.count.into()]);
     for range in model.ranges_mut() {
         *range = match random.u8(..8) {
-            0 => Background::UNTAUGHT,
+            0 => Background::UNKNOWN,
             1 => Background::FAR,
             _ => random.u16(100..4_000),
         };

@@ -50,7 +50,7 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
     let written = crate::written::recording(20, 11);
     let (whole, copy) = (file(&folder, "whole.mcap", &written.bytes), folder.path().join("copy.mcap"));
     let account = converted(&whole, &copy, None).unwrap();
-    assert_eq!((account.telegrams, account.scans, account.left_out), (40, 36, 0));
+    assert_eq!((account.telegrams, account.scans, account.dropped), (40, 36, 0));
     assert_eq!(account.telegrams, written.telegrams.len() as u64);
     assert!(account.damage.is_none(), "{}", account.damage);
     let bytes = fs::read(&copy).unwrap();
@@ -124,7 +124,7 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
     assert_eq!(telegrams(&again), scans);
     // The log contains the encoding, so the reply is not lost.
     let account = converted(&mcap, &log, None).unwrap();
-    assert_eq!((account.telegrams, account.left_out), (30, 0));
+    assert_eq!((account.telegrams, account.dropped), (30, 0));
     let read = frames(&log, Encoding { unit: Unit::Mm, mode: Mode(4) });
     assert!(read.iter().map(|frame| &frame.telegram).eq(&scans[1..]));
 }
@@ -222,7 +222,7 @@ fn recorded_marks_become_rows() {
     let topic = Some("front/marks".to_owned());
     let options = ConvertOptions { input: input.clone(), output, topic, force: true, ..Default::default() };
     let (account, lines) = rows(&options);
-    assert_eq!((account.marks, account.scans, account.telegrams, account.left_out), (Some(4), 3, 0, 0));
+    assert_eq!((account.marks, account.scans, account.telegrams, account.dropped), (Some(4), 3, 0, 0));
     assert_eq!(
         lines,
         [

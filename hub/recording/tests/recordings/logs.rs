@@ -196,17 +196,17 @@ fn the_reply_that_stands_for_an_encoding_is_not_left_out() {
     let there = |name: &str| folder.path().join(name);
     for way in ["a.mcap", "a.bin"] {
         let account = converted(&log, &there(way), None).unwrap();
-        assert_eq!((account.telegrams, account.scans, account.left_out), (3, 3, 0), "{way}");
+        assert_eq!((account.telegrams, account.scans, account.dropped), (3, 3, 0), "{way}");
         for output in ["log", "csv"] {
             let account = converted(&there(way), &there(&format!("{way}.{output}")), None).unwrap();
-            assert_eq!((account.telegrams, account.scans, account.left_out), (3, 3, 0), "{way}, {output}");
+            assert_eq!((account.telegrams, account.scans, account.dropped), (3, 3, 0), "{way}, {output}");
         }
     }
     // Replies that a scanner sent are.
     let recorded = file(&folder, "hub.mcap", &crate::written::recording(20, 14).bytes);
     for output in ["hub.log", "hub.csv"] {
         let account = converted(&recorded, &there(output), Some("front")).unwrap();
-        assert_eq!((account.telegrams, account.left_out), (18, 2), "{output}");
+        assert_eq!((account.telegrams, account.dropped), (18, 2), "{output}");
     }
 }
 

@@ -164,7 +164,7 @@ fn scans_of(path: &Path) -> Vec<Box<Scan>> {
 fn is_same(a: &Scan, b: &Scan) -> bool {
     let angles = |scan: &Scan| (0..scan.beams()).map(|beam| scan.angle(beam)).collect::<Vec<f64>>();
     let is_near = |(a, b): (&f64, &f64)| (a - b).abs() < 1e-5 || a.is_nan() && b.is_nan();
-    (a.beams(), a.flags, a.family, a.collapsed) == (b.beams(), b.flags, b.family, b.collapsed)
+    (a.beams(), a.flags, a.family, a.collisions) == (b.beams(), b.flags, b.family, b.collisions)
         && a.ranges() == b.ranges()
         && a.intensities() == b.intensities()
         && angles(a).iter().zip(&angles(b)).all(is_near)

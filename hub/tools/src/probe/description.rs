@@ -231,7 +231,7 @@ pub(super) struct Turning {
     damaged: Option<f64>,
     points_per_second: Option<f64>,
     turns_per_second: Option<f64>,
-    trouble: Option<String>,
+    problem: Option<String>,
 }
 
 impl Turning {
@@ -252,7 +252,7 @@ impl Turning {
             points_per_second: known(heard.points_per_second),
             turns_per_second: known(heard.turns_per_second),
             // If the line damages bytes, any other problem may be a consequence.
-            trouble: heard.line_trouble().or_else(|| heard.trouble.clone()),
+            problem: heard.line_trouble().or_else(|| heard.trouble.clone()),
         }
     }
 
@@ -293,7 +293,7 @@ impl fmt::Display for Turning {
         )?;
         row("points", self.points_per_second.map(|points| format!("{points:.0} a second")))?;
         row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
-        row("trouble", self.trouble.clone())
+        row("problem", self.problem.clone())
     }
 }
 

@@ -307,7 +307,7 @@ impl OfSensor {
         let around = self.points.range(begin..).map(|point| turned(&point));
         let around = around.take_while(|turned| *turned < end_deg + BACK_DEG);
         let measured = around.filter(|turned| (first_deg..end_deg).contains(turned)).count();
-        let there = told.len() + usize::from(scan.collapsed);
+        let there = told.len() + usize::from(scan.collisions);
         // Those at the very edge may be of either turn.
         if !scan.is_incomplete() && measured.abs_diff(there) > self.exactness.points {
             return Err(format!("{there} of {measured} points, and it is not marked"));

@@ -95,7 +95,7 @@ pub(crate) fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
 }
 
 /// Encodes the obstacles of a sweep as boxes with the metadata `distance_m`, `points`, `foreground` and `near`. The
-/// first entity has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`,
+/// first entity has no shape, and the metadata of the sweep: `sweep`, `generation`, `complete`, `unreliable`, `dropped`,
 /// and `words`, a summary as text. Sweeps end when the mount reverses, so each message deletes all earlier entities,
 /// and has its own lifetime.
 pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
@@ -104,8 +104,8 @@ pub(crate) fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     sweep.add("sweep", found.sweep.to_string());
     sweep.add("generation", found.generation.to_string());
     sweep.add("complete", found.has(Obstacles::COMPLETE).to_string());
-    sweep.add("doubted", found.has(Obstacles::DOUBTED).to_string());
-    sweep.add("left_out", found.left_out.to_string());
+    sweep.add("unreliable", found.has(Obstacles::UNRELIABLE).to_string());
+    sweep.add("dropped", found.dropped.to_string());
     sweep.add("words", words(found));
     let boxes = found.obstacles().iter().enumerate().map(|(number, one)| {
         let id = format!("obstacle {number}");
@@ -140,10 +140,10 @@ fn lifetime_ns(header: &Header) -> u64 {
 }
 
 fn words(found: &Obstacles) -> String {
-    if found.has(Obstacles::DOUBTED) {
-        return "sweep doubted, its angles contradict what is known".to_owned();
+    if found.has(Obstacles::UNRELIABLE) {
+        return "sweep unreliable, its angles contradict what is known".to_owned();
     }
-    let count = u64::from(found.left_out) + found.obstacles().len() as u64;
+    let count = u64::from(found.dropped) + found.obstacles().len() as u64;
     let plural = if count == 1 { "" } else { "s" };
     let obstacles = found.obstacles().first().map_or("no obstacle".to_owned(), |nearest| {
         // One decimal, because screen readers read the text whenever it changes.
@@ -404,8 +404,8 @@ mod tests {
         let mut other = Obstacles { flags: 0, ..found };
         (0..2 * scanhub_schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
         assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
-        other = Obstacles { flags: Obstacles::DOUBTED, ..Obstacles::default() };
-        assert_eq!(words(&other), "sweep doubted, its angles contradict what is known");
+        other = Obstacles { flags: Obstacles::UNRELIABLE, ..Obstacles::default() };
+        assert_eq!(words(&other), "sweep unreliable, its angles contradict what is known");
         assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
         assert_eq!(lifetime_ns(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
     }
