@@ -174,7 +174,7 @@ fn the_page_shows_these_bytes() {
             format!("{lines}{:2}  {digits}\n", 16 * number)
         });
     assert_eq!(section("Payloads").split("```").nth(1), Some(example.as_str()));
-    let reasons = rows("What a receiver refuses");
+    let reasons = rows("Refused datagrams");
     let reasons = reasons.iter().skip(1).map(|row| row[0].trim_matches('`'));
     assert!(reasons.eq(DatagramError::ALL.map(DatagramError::name)));
 }
