@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable, bytes_of, cast_slice, cast_slice_mut, pod_read_una
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::BEAMS;
+use crate::MAX_BEAMS;
 use crate::limits::TopicLimits;
 use crate::payload::{Packed, packed_as_is, read_head, sliced, write};
 use crate::topic::PayloadLen;
@@ -113,7 +113,7 @@ impl Background {
         let head: BackgroundHead = read_head(payload)?;
         let len = Background::len(head.count.into());
         let is_finite = head.first_angle.is_finite() && head.step.is_finite();
-        (usize::from(head.count) <= BEAMS && is_finite && len <= payload.len()).then_some(len)
+        (usize::from(head.count) <= MAX_BEAMS && is_finite && len <= payload.len()).then_some(len)
     }
 
     fn widen(limits: &mut TopicLimits, head: &BackgroundHead) {
@@ -128,7 +128,7 @@ impl fmt::Debug for Background {
 }
 
 /// Maximum number of segments of a scan.
-pub const SEGMENTS: usize = 64;
+pub const MAX_SEGMENTS: usize = 64;
 
 /// Head of a foreground, before the arrays. 24 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
@@ -142,7 +142,7 @@ pub struct ForegroundHead {
     pub count: u16,
     /// Number of beams in the foreground.
     pub beams: u16,
-    /// Number of segments, at most [`SEGMENTS`].
+    /// Number of segments, at most [`MAX_SEGMENTS`].
     pub segments: u16,
     /// Number of segments that did not fit.
     pub dropped: u16,
@@ -155,7 +155,7 @@ sliced! {
     /// The payload of topic `foreground`, one sample per scan even if it is empty. It starts with a [`ForegroundHead`],
     /// whose fields can be read directly. The arrays follow:
     ///
-    /// - [`SEGMENTS`] segments of 16 bytes,
+    /// - [`MAX_SEGMENTS`] segments of 16 bytes,
     /// - a bit for every beam of the scan, in pairs of bytes,
     /// - a range of two bytes for every beam of the scan.
     ///
@@ -185,7 +185,7 @@ pub struct Segment {
 /// Arrays of a foreground, for writing.
 #[derive(Debug)]
 pub struct ForegroundArrays<'a> {
-    /// Room for [`SEGMENTS`] segments.
+    /// Room for [`MAX_SEGMENTS`] segments.
     pub segments: &'a mut [Segment],
     /// Beams in the foreground: beam i is bit i % 8 of byte i / 8.
     pub bits: &'a mut [u8],
@@ -334,7 +334,7 @@ impl Packed for Foreground {
 
 /// Returns a word with a bit for each of the first `segments` segments.
 fn first_bits(segments: usize) -> u64 {
-    if segments < SEGMENTS { (1 << segments) - 1 } else { u64::MAX }
+    if segments < MAX_SEGMENTS { (1 << segments) - 1 } else { u64::MAX }
 }
 
 /// Arrays after the head of a foreground in a datagram, as bytes.
@@ -349,7 +349,7 @@ impl PackedArrays<'_> {
     fn of(payload: &[u8]) -> Option<(ForegroundHead, PackedArrays<'_>)> {
         let head: ForegroundHead = read_head(payload)?;
         let [count, beams, used] = [head.count, head.beams, head.segments].map(usize::from);
-        if count > BEAMS || beams > count || used > SEGMENTS {
+        if count > MAX_BEAMS || beams > count || used > MAX_SEGMENTS {
             return None;
         }
         let (bits, rest) = payload[Foreground::HEAD..].split_at_checked(count.div_ceil(8))?;
@@ -371,7 +371,7 @@ impl fmt::Debug for Foreground {
 }
 
 /// Offset of the bits.
-const BITS: usize = Foreground::HEAD + SEGMENTS * size_of::<Segment>();
+const BITS: usize = Foreground::HEAD + MAX_SEGMENTS * size_of::<Segment>();
 
 /// Returns the length in bytes of a bit for every beam. It is even, because the ranges that follow take two bytes each.
 const fn set(beams: usize) -> usize {

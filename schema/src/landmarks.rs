@@ -7,21 +7,21 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::payload::{FixedPayload, UsedElements, are_finite, used_elements};
 
 /// Maximum number of marks of a scan.
-pub const MARKS: usize = 64;
+pub const MAX_MARKS: usize = 64;
 
 /// The payload of topic `marks`, 1028 bytes: one sample per scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Marks.v2"))]
 #[repr(C)]
 pub struct Marks {
-    /// Number of marks, at most [`MARKS`].
+    /// Number of marks, at most [`MAX_MARKS`].
     pub count: u8,
     /// Flags: [`Marks::OVERFLOW`], [`Marks::UNAVAILABLE`], [`Marks::NO_LEVEL`].
     pub flags: u8,
     /// 0.
     pub reserved: u16,
     /// The marks in the order of their beams; 0 beyond `count`.
-    pub mark_array: [Mark; MARKS],
+    pub mark_array: [Mark; MAX_MARKS],
 }
 
 /// One mark: neighboring beams that a reflector returned.
@@ -52,7 +52,7 @@ impl Default for Marks {
 }
 
 impl FixedPayload for Marks {
-    const ARRAYS: &'static [UsedElements] = &[used_elements!(Marks, mark_array: [Mark; MARKS], count)];
+    const ARRAYS: &'static [UsedElements] = &[used_elements!(Marks, mark_array: [Mark; MAX_MARKS], count)];
 }
 
 impl Marks {
@@ -66,7 +66,7 @@ impl Marks {
 
     /// Returns the used marks.
     pub fn marks(&self) -> &[Mark] {
-        &self.mark_array[..usize::from(self.count).min(MARKS)]
+        &self.mark_array[..usize::from(self.count).min(MAX_MARKS)]
     }
 
     /// Returns whether the sensor sends the data that marks are computed from. Without it, an empty list has no
@@ -87,16 +87,16 @@ impl Marks {
 }
 
 /// Maximum number of lines of a scan, and of corners.
-pub const LINES: usize = 64;
+pub const MAX_LINES: usize = 64;
 
 /// The payload of topic `lines`, 3340 bytes: one sample per scan, in the robot's frame.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Lines.v2"))]
 #[repr(C)]
 pub struct Lines {
-    /// Number of lines, at most [`LINES`].
+    /// Number of lines, at most [`MAX_LINES`].
     pub count: u8,
-    /// Number of corners, at most [`LINES`].
+    /// Number of corners, at most [`MAX_LINES`].
     pub corners: u8,
     /// Flags: [`Lines::OVERFLOW`].
     pub flags: u8,
@@ -109,9 +109,9 @@ pub struct Lines {
     /// Standard deviation of the ranges in meters, estimated from this scan.
     pub noise_m: f32,
     /// The lines in the order of their beams; 0 beyond `count`.
-    pub line_array: [Line; LINES],
+    pub line_array: [Line; MAX_LINES],
     /// The corners in the order of their beams; 0 beyond `corners`.
-    pub corner_array: [Corner; LINES],
+    pub corner_array: [Corner; MAX_LINES],
 }
 
 /// A line feature: a straight surface that neighboring beams end on.
@@ -168,8 +168,8 @@ impl Default for Lines {
 
 impl FixedPayload for Lines {
     const ARRAYS: &'static [UsedElements] = &[
-        used_elements!(Lines, line_array: [Line; LINES], count),
-        used_elements!(Lines, corner_array: [Corner; LINES], corners),
+        used_elements!(Lines, line_array: [Line; MAX_LINES], count),
+        used_elements!(Lines, corner_array: [Corner; MAX_LINES], corners),
     ];
 
     fn is_valid(&self) -> bool {
@@ -191,12 +191,12 @@ impl Lines {
 
     /// Returns the used lines.
     pub fn lines(&self) -> &[Line] {
-        &self.line_array[..usize::from(self.count).min(LINES)]
+        &self.line_array[..usize::from(self.count).min(MAX_LINES)]
     }
 
     /// Returns the used corners.
     pub fn corners(&self) -> &[Corner] {
-        &self.corner_array[..usize::from(self.corners).min(LINES)]
+        &self.corner_array[..usize::from(self.corners).min(MAX_LINES)]
     }
 
     /// Returns whether there were too many lines.

@@ -79,7 +79,7 @@ pub struct UsedElements {
     pub count_at: usize,
 }
 
-/// Returns the [`UsedElements`] of a field: `used_elements!(Marks, mark_array: [Mark; MARKS], count)`.
+/// Returns the [`UsedElements`] of a field: `used_elements!(Marks, mark_array: [Mark; MAX_MARKS], count)`.
 macro_rules! used_elements {
     ($payload:ty, $array:ident: [$element:ty; $max:expr], $count:ident) => {
         $crate::payload::UsedElements {
@@ -385,8 +385,8 @@ pub(crate) use sliced;
 mod tests {
     use super::*;
     use crate::{
-        BEAMS, Background, BackgroundHead, Cloud, CloudHead, CloudPoint, Contents, Corner, Early, Event,
-        EventKind, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, Obstacle, Obstacles, Pose,
+        Background, BackgroundHead, Cloud, CloudHead, CloudPoint, Contents, Corner, Early, Event, EventKind,
+        Foreground, ForegroundHead, Line, Lines, MAX_BEAMS, Mark, Marks, Motion, Obstacle, Obstacles, Pose,
         Scan, ScanHead, Segment, Status, Tilt, Track, TrackSensor, Tracks, Zone, Zones,
     };
 
@@ -568,8 +568,8 @@ mod tests {
         let mut bad = cloud();
         bad.begin(CloudHead { count: 3, ..CloudHead::default() })[2].at[2] = f32::NAN;
         assert_eq!(Cloud::room(bad.bytes()), None);
-        let mut many = vec![0; Cloud::len(BEAMS + 1)];
-        many[8..10].copy_from_slice(&(BEAMS as u16 + 1).to_le_bytes());
+        let mut many = vec![0; Cloud::len(MAX_BEAMS + 1)];
+        many[8..10].copy_from_slice(&(MAX_BEAMS as u16 + 1).to_le_bytes());
         assert_eq!(Cloud::room(&many), None);
         let mut bad = obstacles();
         bad.obstacle_array[0].distance_m = f32::INFINITY;

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize, Serializer};
 
-use crate::{BEAMS, Background, BackgroundHead, Failure, Kind, in_degrees};
+use crate::{Background, BackgroundHead, Failure, Kind, MAX_BEAMS, in_degrees};
 
 /// A model that was read, and its sensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -91,8 +91,8 @@ struct File {
 impl File {
     fn model(&self) -> Result<Box<Background>, String> {
         let count = self.count;
-        if !(1..=BEAMS).contains(&count.into()) {
-            return Err(format!("it has {count} beams, and 1 to {BEAMS} are possible"));
+        if !(1..=MAX_BEAMS).contains(&count.into()) {
+            return Err(format!("it has {count} beams, and 1 to {MAX_BEAMS} are possible"));
         }
         let (first_angle_deg, step_deg) = (self.first_angle_deg, self.step_deg);
         if first_angle_deg.abs() > 360.0 || step_deg == 0.0 || step_deg.abs() > 360.0 {

@@ -13,7 +13,7 @@ use crate::payload::{packed_as_is, read_head, sliced};
 use crate::topic::PayloadLen;
 
 /// Maximum number of beams of a scan, in any family.
-pub const BEAMS: usize = 8192;
+pub const MAX_BEAMS: usize = 8192;
 
 /// Arrays that a scan has in addition to the ranges, each with a value for every beam. Bits of
 /// [`ScanHead::contents`].
@@ -48,7 +48,7 @@ pub struct ScanHead {
     pub first_beam_ns: i32,
     /// Micrometers per device unit.
     pub unit_um: u32,
-    /// Number of beams, at most [`BEAMS`]. They are in the order in which they were measured.
+    /// Number of beams, at most [`MAX_BEAMS`]. They are in the order in which they were measured.
     pub count: u16,
     /// Highest value that is a range; all higher values are codes.
     pub valid_to: u16,
@@ -288,7 +288,7 @@ impl Scan {
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let head: ScanHead = read_head(payload)?;
         let len = Scan::len(head.count.into(), head.contents);
-        let is_known = usize::from(head.count) <= BEAMS && head.contents & !Contents::ALL == 0;
+        let is_known = usize::from(head.count) <= MAX_BEAMS && head.contents & !Contents::ALL == 0;
         let is_finite = head.first_angle.is_finite() && head.step.is_finite() && head.spacing.is_finite();
         (is_known && is_finite && len <= payload.len()).then_some(len)
     }

@@ -13,7 +13,7 @@ use crate::payload::{
 };
 use crate::text::named;
 use crate::topic::PayloadLen;
-use crate::{BEAMS, Header};
+use crate::{Header, MAX_BEAMS};
 
 /// The payload of topic `tilt`, 16 bytes: the angle of a mount. Both stamps of the sample are the time at which the
 /// mount had this angle, not the time of the report.
@@ -55,7 +55,7 @@ pub struct CloudHead {
     pub sweep: u32,
     /// Generation of the background that the points were compared with. Each reset increases it by 1.
     pub generation: u32,
-    /// Number of points, at most [`BEAMS`](crate::BEAMS).
+    /// Number of points, at most [`MAX_BEAMS`](crate::MAX_BEAMS).
     pub count: u16,
     /// Flags: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`UNRELIABLE`](Cloud::UNRELIABLE).
     pub flags: u8,
@@ -173,7 +173,7 @@ impl Cloud {
     /// Returns the length of the cloud in a datagram's payload, or `None` if it is not valid.
     fn packed_len(payload: &[u8]) -> Option<usize> {
         let count = usize::from(read_head::<CloudHead>(payload)?.count);
-        let points = payload.get(Cloud::HEAD..Cloud::len(count)).filter(|_| count <= BEAMS)?;
+        let points = payload.get(Cloud::HEAD..Cloud::len(count)).filter(|_| count <= MAX_BEAMS)?;
         let mut points = points.chunks_exact(size_of::<CloudPoint>()).map(pod_read_unaligned);
         points.all(|point: CloudPoint| are_finite(&point.at)).then_some(Cloud::len(count))
     }
@@ -239,7 +239,7 @@ impl SweepPoints {
 }
 
 /// Maximum number of obstacles of a sweep.
-pub const OBSTACLES: usize = 64;
+pub const MAX_OBSTACLES: usize = 64;
 
 /// The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. It is published even if there are none.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
@@ -252,14 +252,14 @@ pub struct Obstacles {
     pub generation: u32,
     /// Number of obstacles that did not fit.
     pub dropped: u32,
-    /// Number of obstacles, at most [`OBSTACLES`].
+    /// Number of obstacles, at most [`MAX_OBSTACLES`].
     pub count: u8,
     /// Flags: [`COMPLETE`](Self::COMPLETE), [`UNRELIABLE`](Self::UNRELIABLE).
     pub flags: u8,
     /// 0.
     pub reserved: [u8; 2],
     /// The obstacles, the nearest first; 0 beyond `count`.
-    pub obstacle_array: [Obstacle; OBSTACLES],
+    pub obstacle_array: [Obstacle; MAX_OBSTACLES],
 }
 
 /// An object that was found in one sweep. Positions are in the robot's frame, in meters: ahead, to the left, above the
@@ -304,7 +304,7 @@ impl Default for Obstacles {
 
 impl FixedPayload for Obstacles {
     const ARRAYS: &'static [UsedElements] =
-        &[used_elements!(Obstacles, obstacle_array: [Obstacle; OBSTACLES], count)];
+        &[used_elements!(Obstacles, obstacle_array: [Obstacle; MAX_OBSTACLES], count)];
 
     fn is_valid(&self) -> bool {
         let is_finite = |one: &Obstacle| {
@@ -323,7 +323,7 @@ impl Obstacles {
 
     /// Returns the obstacles, the nearest first.
     pub fn obstacles(&self) -> &[Obstacle] {
-        &self.obstacle_array[..usize::from(self.count).min(OBSTACLES)]
+        &self.obstacle_array[..usize::from(self.count).min(MAX_OBSTACLES)]
     }
 
     /// Adds an obstacle, or counts it as left out if there is no room for it.
@@ -407,9 +407,9 @@ mod tests {
     #[test]
     fn what_is_too_many_is_left_out() {
         let mut found = Obstacles { flags: Obstacles::COMPLETE, ..Obstacles::default() };
-        (0..=OBSTACLES as u32).for_each(|points| found.push(Obstacle { points, ..Obstacle::default() }));
-        assert_eq!((found.obstacles().len(), found.dropped), (OBSTACLES, 1));
-        assert_eq!(found.obstacles()[OBSTACLES - 1].points, OBSTACLES as u32 - 1);
+        (0..=MAX_OBSTACLES as u32).for_each(|points| found.push(Obstacle { points, ..Obstacle::default() }));
+        assert_eq!((found.obstacles().len(), found.dropped), (MAX_OBSTACLES, 1));
+        assert_eq!(found.obstacles()[MAX_OBSTACLES - 1].points, MAX_OBSTACLES as u32 - 1);
         assert!(found.has(Obstacles::COMPLETE) && !found.has(Obstacles::UNRELIABLE));
     }
 }

@@ -9,7 +9,7 @@ use crate::text::named;
 use crate::{Pose, text};
 
 /// Maximum number of people in a sample.
-pub const TRACKS: usize = 64;
+pub const MAX_TRACKS: usize = 64;
 /// Maximum number of sensors that a sample names.
 pub const TRACK_SENSORS: usize = 32;
 
@@ -19,14 +19,14 @@ pub const TRACK_SENSORS: usize = 32;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Tracks.v2"))]
 #[repr(C)]
 pub struct Tracks {
-    /// Number of people, at most [`TRACKS`].
+    /// Number of people, at most [`MAX_TRACKS`].
     pub count: u8,
     /// Number of sensors of the site, at most [`TRACK_SENSORS`].
     pub sensors: u8,
     /// 0.
     pub reserved: [u8; 6],
     /// The people by ID; 0 beyond `count`.
-    pub track_array: [Track; TRACKS],
+    pub track_array: [Track; MAX_TRACKS],
     /// The sensors in the order of the site; 0 beyond `sensors`.
     pub sensor_array: [TrackSensor; TRACK_SENSORS],
 }
@@ -117,7 +117,7 @@ impl Default for TrackSensor {
 
 impl FixedPayload for Tracks {
     const ARRAYS: &'static [UsedElements] = &[
-        used_elements!(Tracks, track_array: [Track; TRACKS], count),
+        used_elements!(Tracks, track_array: [Track; MAX_TRACKS], count),
         used_elements!(Tracks, sensor_array: [TrackSensor; TRACK_SENSORS], sensors),
     ];
 
@@ -135,7 +135,7 @@ impl FixedPayload for Tracks {
 impl Tracks {
     /// Returns the people.
     pub fn tracks(&self) -> &[Track] {
-        &self.track_array[..usize::from(self.count).min(TRACKS)]
+        &self.track_array[..usize::from(self.count).min(MAX_TRACKS)]
     }
 
     /// Returns the sensors of the site.
@@ -150,7 +150,7 @@ impl Tracks {
         sensors.filter(move |(i, _)| bits >> i & 1 == 1).map(|(_, sensor)| sensor.name())
     }
 
-    /// Adds a person, unless there are [`TRACKS`] already.
+    /// Adds a person, unless there are [`MAX_TRACKS`] already.
     pub fn push(&mut self, track: Track) {
         if let Some(place) = self.track_array.get_mut(usize::from(self.count)) {
             *place = track;
@@ -323,10 +323,10 @@ mod tests {
     #[test]
     fn what_is_too_many_is_left_out() {
         let mut tracks = Tracks::default();
-        (0..=TRACKS as u64).for_each(|id| tracks.push(Track { id, ..Track::default() }));
+        (0..=MAX_TRACKS as u64).for_each(|id| tracks.push(Track { id, ..Track::default() }));
         (0..=TRACK_SENSORS).for_each(|_| tracks.push_sensor(TrackSensor::default()));
-        assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (TRACKS, TRACK_SENSORS));
-        assert_eq!(tracks.tracks()[TRACKS - 1].id, TRACKS as u64 - 1);
+        assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (MAX_TRACKS, TRACK_SENSORS));
+        assert_eq!(tracks.tracks()[MAX_TRACKS - 1].id, MAX_TRACKS as u64 - 1);
     }
 
     #[test]

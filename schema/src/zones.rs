@@ -8,7 +8,7 @@ use crate::payload::{FixedPayload, UsedElements, used_elements};
 use crate::text::named;
 
 /// Maximum number of zones of a sensor.
-pub const ZONES: usize = 8;
+pub const MAX_ZONES: usize = 8;
 
 /// The payload of topic `zones`, 76 bytes. There is one sample per scan, and one with verdict unknown when scans stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
@@ -17,7 +17,7 @@ pub const ZONES: usize = 8;
 pub struct Zones {
     /// Verdict: [`Verdict`]. Treat unknown, and every other number, as stop.
     pub verdict: u8,
-    /// Number of zones, at most [`ZONES`].
+    /// Number of zones, at most [`MAX_ZONES`].
     pub count: u8,
     /// Beam of the point nearest to the robot's center; [`Zones::NO_BEAM`] if no beam has a valid reading.
     pub nearest_beam: u16,
@@ -30,7 +30,7 @@ pub struct Zones {
     /// 0.
     pub reserved: u8,
     /// The zones, the largest first; 0 beyond `count`.
-    pub zone_array: [Zone; ZONES],
+    pub zone_array: [Zone; MAX_ZONES],
 }
 
 /// One zone: a circle around the robot's center.
@@ -55,7 +55,7 @@ impl Default for Zones {
 }
 
 impl FixedPayload for Zones {
-    const ARRAYS: &'static [UsedElements] = &[used_elements!(Zones, zone_array: [Zone; ZONES], count)];
+    const ARRAYS: &'static [UsedElements] = &[used_elements!(Zones, zone_array: [Zone; MAX_ZONES], count)];
 }
 
 impl Zones {
@@ -88,7 +88,7 @@ impl Zones {
 
     /// Returns the used zones, the largest first.
     pub fn zones(&self) -> &[Zone] {
-        &self.zone_array[..usize::from(self.count).min(ZONES)]
+        &self.zone_array[..usize::from(self.count).min(MAX_ZONES)]
     }
 
     /// Returns the verdict; unknown if this version does not know its number.

@@ -4,12 +4,12 @@
 use std::mem::{offset_of, size_of};
 
 use scanhub_schema::{
-    BEAMS, Background, BackgroundHead, BackgroundWord, COUNTERS, Cloud, CloudHead, CloudPoint, CloudWord,
-    Code, Contents, Corner, Counter, Counters, Early, Event, EventKind, Failure, Family, Foreground,
-    ForegroundHead, ForegroundWord, Header, Kind, LINES, Line, Lines, Mark, Marks, Motion, MotionMethod,
-    OBSTACLES, Obstacle, Obstacles, PointClass, Pose, Request, Response, SEGMENTS, Scan, ScanHead, ScanWord,
-    Segment, Shown, State, Status, TRACK_SENSORS, TRACKS, Tilt, Track, TrackSensor, TrackState, Tracks, Verb,
-    Verdict, Zone, Zones,
+    Background, BackgroundHead, BackgroundWord, COUNTERS, Cloud, CloudHead, CloudPoint, CloudWord, Code,
+    Contents, Corner, Counter, Counters, Early, Event, EventKind, Failure, Family, Foreground,
+    ForegroundHead, ForegroundWord, Header, Kind, Line, Lines, MAX_BEAMS, MAX_LINES, MAX_OBSTACLES,
+    MAX_SEGMENTS, MAX_TRACKS, Mark, Marks, Motion, MotionMethod, Obstacle, Obstacles, PointClass, Pose,
+    Request, Response, Scan, ScanHead, ScanWord, Segment, Shown, State, Status, TRACK_SENSORS, Tilt, Track,
+    TrackSensor, TrackState, Tracks, Verb, Verdict, Zone, Zones,
 };
 
 /// Builds the expected bytes: `size` zeros with `fields` written over them.
@@ -153,7 +153,7 @@ fn foreground_layout() {
     assert_eq!((offset_of!(ForegroundHead, count), offset_of!(ForegroundHead, beams)), (8, 10));
     assert_eq!((offset_of!(ForegroundHead, segments), offset_of!(ForegroundHead, dropped)), (12, 14));
     assert_eq!(offset_of!(ForegroundHead, supported), 16);
-    assert_eq!((size_of::<Segment>(), align_of::<Segment>(), SEGMENTS), (16, 4, 64));
+    assert_eq!((size_of::<Segment>(), align_of::<Segment>(), MAX_SEGMENTS), (16, 4, 64));
     assert_eq!((offset_of!(Segment, first), offset_of!(Segment, last)), (0, 2));
     assert_eq!((offset_of!(Segment, nearest), offset_of!(Segment, width)), (4, 6));
     assert_eq!((offset_of!(Segment, x_mm), offset_of!(Segment, y_mm)), (8, 12));
@@ -347,7 +347,7 @@ fn response_bytes() {
 
 #[test]
 fn scan_layout() {
-    assert_eq!((size_of::<ScanHead>(), align_of::<ScanHead>(), Scan::HEAD, BEAMS), (64, 8, 64, 8192));
+    assert_eq!((size_of::<ScanHead>(), align_of::<ScanHead>(), Scan::HEAD, MAX_BEAMS), (64, 8, 64, 8192));
     assert_eq!((size_of::<ScanWord>(), align_of::<ScanWord>()), (8, 8));
     assert_eq!((offset_of!(ScanHead, first_angle), offset_of!(ScanHead, step)), (0, 8));
     assert_eq!((offset_of!(ScanHead, spacing), offset_of!(ScanHead, beam_time_ns)), (16, 20));
@@ -491,7 +491,7 @@ fn lines_layout() {
         (4, 6, 8)
     );
     assert_eq!((offset_of!(Lines, line_array), offset_of!(Lines, corner_array)), (12, 2572));
-    assert_eq!((size_of::<Line>(), align_of::<Line>(), LINES), (40, 4, 64));
+    assert_eq!((size_of::<Line>(), align_of::<Line>(), MAX_LINES), (40, 4, 64));
     assert_eq!((offset_of!(Line, x1_m), offset_of!(Line, y1_m), offset_of!(Line, x2_m)), (0, 4, 8));
     assert_eq!((offset_of!(Line, y2_m), offset_of!(Line, r_m), offset_of!(Line, alpha_rad)), (12, 16, 20));
     assert_eq!(
@@ -645,7 +645,7 @@ fn cloud_bytes() {
 
 #[test]
 fn obstacles_layout() {
-    assert_eq!((size_of::<Obstacles>(), align_of::<Obstacles>(), OBSTACLES), (3088, 4, 64));
+    assert_eq!((size_of::<Obstacles>(), align_of::<Obstacles>(), MAX_OBSTACLES), (3088, 4, 64));
     assert_eq!((offset_of!(Obstacles, sweep), offset_of!(Obstacles, generation)), (0, 4));
     assert_eq!((offset_of!(Obstacles, dropped), offset_of!(Obstacles, count)), (8, 12));
     assert_eq!((offset_of!(Obstacles, flags), offset_of!(Obstacles, reserved)), (13, 14));
@@ -688,7 +688,7 @@ fn obstacles_bytes() {
 
 #[test]
 fn tracks_layout() {
-    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), TRACKS, TRACK_SENSORS), (7432, 8, 64, 32));
+    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), MAX_TRACKS, TRACK_SENSORS), (7432, 8, 64, 32));
     assert_eq!(
         (offset_of!(Tracks, count), offset_of!(Tracks, sensors), offset_of!(Tracks, reserved)),
         (0, 1, 2)

@@ -4,7 +4,7 @@ use scanhub_preprocess::background::{Candidate, Method, Model, Settings, Start};
 use scanhub_preprocess::segments::Segmenter;
 use scanhub_preprocess::{marks, zones};
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{BEAMS, Background, Contents, Foreground, Marks, Scan, Verdict, ZONES, Zones};
+use scanhub_schema::{Background, Contents, Foreground, MAX_BEAMS, MAX_ZONES, Marks, Scan, Verdict, Zones};
 
 use super::scans::{Bytes, fill, layout};
 
@@ -55,7 +55,7 @@ pub(super) fn processors(data: &[u8]) {
     let (mut zones, mut marks) = (Zones::unknown(), Marks::default());
     let mut foreground = Foreground::of(most);
     let mut background = Background::zeroed(Background::len(most));
-    let mut scan = Scan::zeroed(Scan::len(BEAMS, Contents::ALL));
+    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, Contents::ALL));
     while !bytes.is_empty() {
         match bytes.u8() {
             0..=3 => model.reset(),
@@ -86,7 +86,7 @@ pub(super) fn processors(data: &[u8]) {
 
 fn assert_zones(scan: &Scan, radii_mm: &[u16], zones: &Zones) {
     let used = zones.zones();
-    assert_eq!(used.len(), radii_mm.len().min(ZONES));
+    assert_eq!(used.len(), radii_mm.len().min(MAX_ZONES));
     assert!(used.iter().zip(radii_mm).all(|(zone, radius)| zone.radius_mm == *radius));
     assert!(used.iter().all(|zone| usize::from(zone.beams) <= scan.beams()));
     if radii_mm.is_sorted_by(|larger, smaller| larger >= smaller) {

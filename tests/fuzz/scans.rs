@@ -1,6 +1,6 @@
 //! Scans, and what they are read as, from the bytes of an input. Refuses to know who looks at them.
 
-use scanhub_schema::{BEAMS, Contents, Family, Pose, Scan, ScanArrays, ScanHead};
+use scanhub_schema::{Contents, Family, MAX_BEAMS, Pose, Scan, ScanArrays, ScanHead};
 
 /// Another sensor, or the same one set otherwise; now and then one that there is.
 pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
@@ -15,7 +15,7 @@ pub(super) fn layout(bytes: &mut Bytes<'_>, scan: &mut Scan) {
         first_angle: in_radians(first_angle_mdeg),
         step: in_radians(step_mdeg.into()),
         unit_um: 1000 * u32::from(unit_mm),
-        count: count.min(BEAMS as u16),
+        count: count.min(MAX_BEAMS as u16),
         valid_to: greatest.saturating_sub(9),
         no_return: greatest,
         beyond: greatest.saturating_sub(8),

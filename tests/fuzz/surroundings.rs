@@ -6,7 +6,7 @@ use scanhub_preprocess::lines::{self, LineFinder, Stop};
 use scanhub_preprocess::motion::{self, MotionEstimator};
 use scanhub_schema::datagram::Packed;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{BEAMS, Contents, Foreground, Lines, Motion, MotionMethod, Scan};
+use scanhub_schema::{Contents, Foreground, Lines, MAX_BEAMS, Motion, MotionMethod, Scan};
 
 use super::scans::{Bytes, fill, layout};
 
@@ -30,7 +30,7 @@ pub(super) fn surroundings(data: &[u8]) {
     let mut estimator = MotionEstimator::new(pose, of_motion, most);
     let mut model = Model::new(MAP, most);
     let mut foreground = Foreground::of(most);
-    let mut scan = Scan::zeroed(Scan::len(BEAMS, Contents::ALL));
+    let mut scan = Scan::zeroed(Scan::len(MAX_BEAMS, Contents::ALL));
     let (mut before, mut stamp_ns) = (Motion::default(), 0);
     for _ in 0..SCANS {
         if bytes.is_empty() {

@@ -5,7 +5,7 @@
 use serde_json::{Value, json};
 
 use crate::testkit::{INT, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, sequence};
-use scanhub_schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic};
+use scanhub_schema::{Contents, Family, MAX_BEAMS, Scan, ScanHead, Topic};
 
 /// What both say of one scan, but for what is of the place where it was published.
 fn said(line: &Value) -> Vec<Value> {
@@ -115,7 +115,7 @@ fn a_sender_who_asks_for_more_with_each_scan_gets_all_of_it_at_once() {
             let head = ScanHead { contents: Contents::ALL, ..ScanHead::turning(Family::Ld, beams) };
             Scan::of(head, &vec![1_234; beams])
         };
-        let beams: Vec<usize> = (450..470).chain([BEAMS, 450]).collect();
+        let beams: Vec<usize> = (450..470).chain([MAX_BEAMS, 450]).collect();
         for &beams in &beams {
             sender.send(Topic::Scan, &*turn(beams));
             let line = echo.await_line("a scan", is_class("scan"));

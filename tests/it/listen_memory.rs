@@ -9,7 +9,7 @@ use crate::testkit::{
     INT, Program, Sender, TestEnv, USR1, in_a_network, is_class, let_pass, number, sequence, shared_memory,
     until,
 };
-use scanhub_schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic, Zones};
+use scanhub_schema::{Contents, Family, MAX_BEAMS, Scan, ScanHead, Topic, Zones};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const NAME: &str = "--name=robot1=5f3a12bc00d1e2f3";
@@ -21,8 +21,8 @@ fn publisher(env: &TestEnv, megabytes: u64) -> Program {
 
 /// The longest scan that there can be.
 fn longest() -> Box<Scan> {
-    let head = ScanHead { contents: Contents::ALL, ..ScanHead::turning(Family::Ld, BEAMS) };
-    Scan::of(head, &vec![1_234; BEAMS])
+    let head = ScanHead { contents: Contents::ALL, ..ScanHead::turning(Family::Ld, MAX_BEAMS) };
+    Scan::of(head, &vec![1_234; MAX_BEAMS])
 }
 
 /// Bytes of all files of the domain in shared memory.

@@ -15,7 +15,7 @@ mod sweep;
 use std::collections::VecDeque;
 
 use scanhub_schema::Scan;
-pub use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
+pub use scanhub_schema::{MAX_OBSTACLES, Obstacle, PointClass};
 use serde::{Serialize, Serializer};
 
 pub use self::angles::{Angle, DropReason};

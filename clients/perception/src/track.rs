@@ -407,7 +407,8 @@ impl Event {
     }
 }
 
-const _: () = assert!(PERSONS == scanhub_schema::TRACKS && site::SENSORS == scanhub_schema::TRACK_SENSORS);
+const _: () =
+    assert!(PERSONS == scanhub_schema::MAX_TRACKS && site::SENSORS == scanhub_schema::TRACK_SENSORS);
 
 #[cfg(test)]
 mod tests {

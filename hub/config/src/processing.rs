@@ -8,7 +8,9 @@ use scanhub_files::regular;
 use scanhub_preprocess::background::{Candidate, Method, Settings as Learning, Start};
 use scanhub_preprocess::zones::{Check, SECTORS, Sector};
 use scanhub_preprocess::{lines, marks, motion, zones};
-use scanhub_schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, Scan, ScanHead, ZONES};
+use scanhub_schema::{
+    Failure, Family, Kind, MAX_BEAMS, MAX_LINES, MAX_ZONES, Pose, SavedModel, Scan, ScanHead,
+};
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use toml::de::DeTable;
@@ -144,7 +146,7 @@ section! {
         /// beams inside a circle that violate it
         ///
         /// A circle is violated if at least this number of beams is inside.
-        min_beams: i64 = 1, check whole(1..=BEAMS as i64);
+        min_beams: i64 = 1, check whole(1..=MAX_BEAMS as i64);
         /// consecutive scans in which they do
         ///
         /// Number of consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until this number of
@@ -198,7 +200,7 @@ section! {
         /// beams that may be missing in a mark
         ///
         /// Maximum number of beams that may be missing between two beams of a mark.
-        max_gap: i64 = 0, check whole(0..=BEAMS as i64);
+        max_gap: i64 = 0, check whole(0..=MAX_BEAMS as i64);
     }
 }
 
@@ -209,11 +211,11 @@ section! {
         ///
         /// Maximum number of lines of a scan, 1 to 64. If there are more, those that differ least are joined, and beams
         /// that fit no line well are left out.
-        max: i64 = 64, check whole(1..=LINES as i64);
+        max: i64 = 64, check whole(1..=MAX_LINES as i64);
         /// beams of a line, at least 3
         ///
         /// Minimum number of beams of a line, 3 to 8192.
-        min_points: i64 = 5, check whole(3..=BEAMS as i64);
+        min_points: i64 = 5, check whole(3..=MAX_BEAMS as i64);
         /// the slower, better fit
         ///
         /// Whether cuts between lines are moved to wherever they help most, and beams that fit worst at the ends of lines
@@ -470,7 +472,7 @@ fn in_mm(meters: f64) -> u16 {
 
 fn radii(key: &str, radii: &[f64]) -> Checked {
     let refuse = |remedy: &str| Err(refused(format!("{key} = {radii:?}"), remedy));
-    if !(1..=ZONES).contains(&radii.len()) {
+    if !(1..=MAX_ZONES).contains(&radii.len()) {
         return refuse("1 to 8 radii, the largest first, for example [1.0, 0.6]");
     }
     if !radii.iter().all(|radius| (0.001..=MAX_RADIUS_M).contains(radius)) {

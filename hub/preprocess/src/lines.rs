@@ -13,7 +13,7 @@ mod pieces;
 
 use std::f32::consts::{PI, TAU};
 
-use scanhub_schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
+use scanhub_schema::{Corner, Line, Lines, MAX_BEAMS, MAX_LINES, Pose, Scan};
 
 use crate::directions::Directions;
 
@@ -47,7 +47,7 @@ pub enum Stop {
 
 impl Default for Settings {
     fn default() -> Self {
-        Settings { max: LINES as u8, min_points: 5, refine: false, stop: Stop::Likelihood }
+        Settings { max: MAX_LINES as u8, min_points: 5, refine: false, stop: Stop::Likelihood }
     }
 }
 
@@ -69,7 +69,7 @@ pub struct LineFinder {
 impl LineFinder {
     /// Creates a finder for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, settings: Settings, beams: usize) -> LineFinder {
-        let beams = beams.min(BEAMS);
+        let beams = beams.min(MAX_BEAMS);
         LineFinder {
             pose,
             settings,
@@ -181,7 +181,7 @@ impl LineFinder {
             Stop::Number(_) => (0.0, f64::INFINITY, f64::INFINITY),
         };
         Bounds {
-            max: usize::from(max).min(LINES),
+            max: usize::from(max).min(MAX_LINES),
             penalty,
             variance,
             loss,

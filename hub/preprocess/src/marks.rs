@@ -3,7 +3,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use scanhub_schema::{Contents, Family, Intensities, MARKS, Mark, Marks, Scan, in_degrees};
+use scanhub_schema::{Contents, Family, Intensities, MAX_MARKS, Mark, Marks, Scan, in_degrees};
 
 use crate::directions::exact_angle;
 use crate::search::position;
@@ -197,4 +197,4 @@ fn half_up(sum: u128, weight: u64) -> u128 {
     (2 * sum + weight) / (2 * weight)
 }
 
-const _: () = assert!(MARKS <= u8::MAX as usize);
+const _: () = assert!(MAX_MARKS <= u8::MAX as usize);

@@ -13,7 +13,7 @@ mod matching;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use scanhub_schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
+use scanhub_schema::{Corner, Line, Lines, MAX_BEAMS, Motion, MotionMethod, Pose, Scan};
 
 use crate::lines::{self, LineFinder};
 pub use crate::velocity::Rigid;
@@ -89,7 +89,7 @@ struct Track {
 impl MotionEstimator {
     /// Creates an estimator for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, settings: Settings, beams: usize) -> MotionEstimator {
-        let beams = beams.min(BEAMS);
+        let beams = beams.min(MAX_BEAMS);
         MotionEstimator {
             pose,
             settings,

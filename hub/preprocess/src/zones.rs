@@ -7,7 +7,7 @@
 
 use std::f64::consts::TAU;
 
-use scanhub_schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
+use scanhub_schema::{MAX_ZONES, Pose, Scan, ScanHead, Verdict, Zone, Zones, in_sector_mdeg};
 
 use crate::search::position;
 
@@ -28,7 +28,7 @@ pub const SECTORS: usize = 64;
 /// Settings of a check.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Radii of the circles, the largest first, at most [`ZONES`]. More are ignored.
+    /// Radii of the circles, the largest first, at most [`MAX_ZONES`]. More are ignored.
     pub radii_mm: Vec<u16>,
     /// The robot's own body. Where sectors overlap, the largest range counts.
     pub body_mask: Vec<Sector>,
@@ -91,7 +91,7 @@ pub struct Check {
     /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
     seen: u16,
     /// Number of consecutive scans in which enough beams met something, by circle.
-    streaks: [u16; ZONES],
+    streaks: [u16; MAX_ZONES],
     /// Whether scans may be older than they seem.
     is_late: bool,
 }
@@ -104,7 +104,7 @@ impl Check {
             min_scans: settings.min_scans.max(1),
             table: Table::new(pose, settings, beams),
             seen: 0,
-            streaks: [0; ZONES],
+            streaks: [0; MAX_ZONES],
             is_late: false,
         }
     }
@@ -163,7 +163,7 @@ impl Check {
     pub fn stale(&mut self, out: &mut Zones) {
         self.forget();
         *out = Zones { count: self.table.circles as u8, ..Zones::unknown() };
-        self.write_circles(&[0; ZONES], out);
+        self.write_circles(&[0; MAX_ZONES], out);
     }
 
     /// Sets whether scans may be older than they seem from now on. Points of such a scan in the smallest circle count.
@@ -184,7 +184,7 @@ impl Check {
 
     fn forget(&mut self) {
         self.seen = 0;
-        self.streaks = [0; ZONES];
+        self.streaks = [0; MAX_ZONES];
     }
 
     fn is_violated(&self, zone: usize) -> bool {
@@ -202,7 +202,7 @@ impl Check {
         }
     }
 
-    fn write_circles(&self, beams: &[u16; ZONES], out: &mut Zones) {
+    fn write_circles(&self, beams: &[u16; MAX_ZONES], out: &mut Zones) {
         out.flags = if self.seen < self.min_scans { Zones::PROVISIONAL } else { 0 };
         out.reserved = 0;
         for (zone, circle) in out.zone_array.iter_mut().enumerate() {
@@ -250,10 +250,10 @@ impl Layout {
 /// The circles of a sensor, computed for the layout of its last scan.
 struct Table {
     pose: Pose,
-    /// Number of circles, at most [`ZONES`].
+    /// Number of circles, at most [`MAX_ZONES`].
     circles: usize,
     /// Radii of the circles; 0 for unused ones.
-    radii_mm: [u16; ZONES],
+    radii_mm: [u16; MAX_ZONES],
     /// The robot's own body: the sectors, and their number.
     sectors: ([Sector; SECTORS], usize),
     margin_mm: u16,
@@ -263,7 +263,7 @@ struct Table {
 
     layout: Layout,
     /// Valid readings inside each circle, beyond the robot's own body.
-    inside: [Spans; ZONES],
+    inside: [Spans; MAX_ZONES],
     nearest: Nearest,
     /// 1 for relevant beams: a reading of them may lie inside the largest circle.
     tells: Box<[u16]>,
@@ -277,7 +277,7 @@ struct Table {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Met {
     /// Number of beams that met something inside each circle.
-    inside: [u16; ZONES],
+    inside: [u16; MAX_ZONES],
     /// Beam whose point is nearest to the robot's center, and its distance in mm, rounded down. The first one of
     /// several.
     nearest: Option<(u16, u32)>,
@@ -286,8 +286,8 @@ struct Met {
 impl Table {
     /// Creates a table for a sensor with at most `beams` beams.
     fn new(pose: Pose, settings: &Settings, beams: usize) -> Table {
-        let circles = settings.radii_mm.len().min(ZONES);
-        let mut radii_mm = [0; ZONES];
+        let circles = settings.radii_mm.len().min(MAX_ZONES);
+        let mut radii_mm = [0; MAX_ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
         let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; SECTORS];
         let count = settings.body_mask.len().min(SECTORS);

@@ -4,7 +4,7 @@ mod scans;
 
 use fastrand::Rng;
 use scanhub_preprocess::marks::{MarkDetector, Settings};
-use scanhub_schema::{Family, MARKS, Mark, Marks, Scan, ScanHead};
+use scanhub_schema::{Family, MAX_MARKS, Mark, Marks, Scan, ScanHead};
 
 /// A beam that belongs to a mark: its index, range in mm and intensity.
 #[derive(Clone, Copy)]
@@ -95,8 +95,8 @@ fn marks_are_those_of_the_definition() {
         let mut out: Marks = bytemuck::pod_read_unaligned(&[0xA5; size_of::<Marks>()]);
         MarkDetector::new(settings).update(&scan, &mut out);
         let groups = groups(&scan, settings);
-        assert_eq!(usize::from(out.count), groups.len().min(MARKS), "{settings:?}");
-        assert_eq!((out.is_overflow(), out.is_available()), (groups.len() > MARKS, true));
+        assert_eq!(usize::from(out.count), groups.len().min(MAX_MARKS), "{settings:?}");
+        assert_eq!((out.is_overflow(), out.is_available()), (groups.len() > MAX_MARKS, true));
         for (group, mark) in groups.iter().zip(out.marks()) {
             assert_mark(&scan, group, mark);
         }

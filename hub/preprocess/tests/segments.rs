@@ -1,7 +1,7 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
 use scanhub_preprocess::segments::Segmenter;
-use scanhub_schema::{Contents, Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
+use scanhub_schema::{Contents, Foreground, ForegroundHead, MAX_SEGMENTS, Pose, Scan, ScanHead, Segment};
 
 /// Beams of every scan here.
 const BEAMS: usize = 401;
@@ -84,13 +84,13 @@ fn segments_are_those_of_the_formula() {
         if is_exact {
             let mut of_grid = foreground(&ranges);
             Segmenter::new(pose, BEAMS).update(&Scan::of(head, &[0; BEAMS]), &mut of_grid);
-            others += usize::from(usize::from(of_grid.segments) != expected.len().min(SEGMENTS));
+            others += usize::from(usize::from(of_grid.segments) != expected.len().min(MAX_SEGMENTS));
         }
 
         let mut out = foreground(&ranges);
         Segmenter::new(pose, BEAMS).update(&scan, &mut out);
-        assert_eq!(usize::from(out.segments), expected.len().min(SEGMENTS), "round {round}");
-        assert_eq!(usize::from(out.dropped), expected.len().saturating_sub(SEGMENTS));
+        assert_eq!(usize::from(out.segments), expected.len().min(MAX_SEGMENTS), "round {round}");
+        assert_eq!(usize::from(out.dropped), expected.len().saturating_sub(MAX_SEGMENTS));
         let (used, head) = (out.segments().len(), **out);
         assert!(out.clone().begin(head).segments[used..].iter().all(|rest| *rest == Segment::default()));
         for (segment, beams) in out.segments().iter().zip(expected) {
@@ -110,7 +110,7 @@ fn segments_are_those_of_the_formula() {
             }
         }
     }
-    assert!(most > SEGMENTS, "{most} segments at most: none was left out");
+    assert!(most > MAX_SEGMENTS, "{most} segments at most: none was left out");
     assert!(others > 100, "{others} differ from those of an even grid");
 }
 

@@ -2,7 +2,7 @@
 
 use scanhub_schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
 use scanhub_schema::{
-    BEAMS, Background, Cloud, Code, Early, Event, Family, Foreground, Lines, Marks, Motion, Obstacle,
+    Background, Cloud, Code, Early, Event, Family, Foreground, Lines, MAX_BEAMS, Marks, Motion, Obstacle,
     Obstacles, Scan, Status, Tilt, Topic, Tracks, Zones,
 };
 use serde_json::{Map, Value, json};
@@ -29,7 +29,7 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
         Some(Topic::Scan) => scan(&unpacked(Scan::zeroed(MTU_SAFE), payload)),
         Some(Topic::Marks) => marks(&unpacked(Box::<Marks>::default(), payload)),
         Some(Topic::Zones) => zones(&unpacked(Box::<Zones>::default(), payload)),
-        Some(Topic::Foreground) => foreground(&unpacked(Foreground::of(BEAMS), payload)),
+        Some(Topic::Foreground) => foreground(&unpacked(Foreground::of(MAX_BEAMS), payload)),
         Some(Topic::Background) => background(&unpacked(Background::zeroed(MTU_SAFE), payload)),
         Some(Topic::Lines) => lines(&unpacked(Box::<Lines>::default(), payload)),
         Some(Topic::Motion) => motion(&unpacked(Box::<Motion>::default(), payload)),

@@ -99,10 +99,10 @@ pub(crate) fn counts(layout: &Layout) -> Vec<(&str, usize)> {
     let arrays = layout.fields.iter().filter(|field| field.name.ends_with("_array"));
     let mut counts: Vec<_> = arrays.map(|field| (count_of(layout, field), field.len.unwrap_or(1))).collect();
     if !packed_tail(&layout.name).is_empty() {
-        counts.push(("count", scanhub_schema::BEAMS));
+        counts.push(("count", scanhub_schema::MAX_BEAMS));
     }
     if layout.name == "Foreground" {
-        counts.push(("segments", scanhub_schema::SEGMENTS));
+        counts.push(("segments", scanhub_schema::MAX_SEGMENTS));
     }
     counts
 }

@@ -6,7 +6,7 @@ use std::rc::Rc;
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use scanhub_schema::datagram::Packed;
 use scanhub_schema::limits::TopicLimits;
-use scanhub_schema::{BEAMS, Contents, Failure, Header, Kind, Telegram, Topic, Wake};
+use scanhub_schema::{Contents, Failure, Header, Kind, MAX_BEAMS, Telegram, Topic, Wake};
 use scanhub_shm::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
 use scanhub_shm::{Domain, Payload};
 
@@ -124,7 +124,7 @@ impl SharedTopics {
             ..limits
         };
         Some(if known != self.limits && self.widened >= WIDENED_EXACTLY {
-            TopicLimits { beams: BEAMS, contents: Contents::ALL, telegram: Telegram::MAX, ..known }
+            TopicLimits { beams: MAX_BEAMS, contents: Contents::ALL, telegram: Telegram::MAX, ..known }
         } else {
             known
         })

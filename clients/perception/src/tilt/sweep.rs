@@ -1,7 +1,7 @@
 //! Classifies the points of a sweep against the background, decides whether the angles of the sweep are reliable, and finds
 //! obstacles: clusters of points in three dimensions.
 
-use scanhub_schema::{OBSTACLES, Obstacle, PointClass};
+use scanhub_schema::{MAX_OBSTACLES, Obstacle, PointClass};
 
 use super::background::{Model, Reading, placed};
 use super::mount::Mount;
@@ -250,8 +250,8 @@ impl Clusters {
             }
         }
         self.found.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
-        let dropped = self.found.len().saturating_sub(OBSTACLES) as u32;
-        self.found.truncate(OBSTACLES);
+        let dropped = self.found.len().saturating_sub(MAX_OBSTACLES) as u32;
+        self.found.truncate(MAX_OBSTACLES);
         (&self.found, dropped)
     }
 

@@ -148,7 +148,7 @@ pub const NO_RETURN: u16 = Code::NoReturn.value();
 /// Range of a beam without a point in this revolution.
 pub const NOT_MEASURED: u16 = Scan::NOT_MEASURED;
 /// Numbers of beams that a revolution may have.
-pub const BEAMS: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::BEAMS;
+pub const BEAMS: core::ops::RangeInclusive<usize> = 2..=scanhub_schema::MAX_BEAMS;
 
 /// Equal bins all around for a head that rotates clockwise. Beam 0 is ahead, and beam `i` at `-i` times the step, so beams
 /// are in the order of measuring. The bin of beam 0 begins half a step before the scanner's zero: 0 and 360 degrees are

@@ -402,7 +402,7 @@ mod tests {
         assert_eq!(one["cubes"][0]["size"], serde_json::json!({ "x": 1.0, "y": 1.0, "z": 1.5 }));
         assert_eq!(words(&found), "1 obstacle, nearest 1.0 m");
         let mut other = Obstacles { flags: 0, ..found };
-        (0..2 * scanhub_schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
+        (0..2 * scanhub_schema::MAX_OBSTACLES).for_each(|_| other.push(Obstacle::default()));
         assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
         other = Obstacles { flags: Obstacles::UNRELIABLE, ..Obstacles::default() };
         assert_eq!(words(&other), "sweep unreliable, its angles contradict what is known");
