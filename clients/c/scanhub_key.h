@@ -178,7 +178,7 @@ static inline enum scanhub_result scanhub_read_with(const struct scanhub_key *ke
 #define SCANHUB_STREAMS 128
 
 /* A gateway, and the greatest epoch that came of it. */
-struct scanhub_life {
+struct scanhub_run {
     uint64_t hub;
     uint32_t epoch;
 };
@@ -192,11 +192,11 @@ struct scanhub_stream {
     uint8_t seen[128];
 };
 
-/* What came with the key. Begin with all 0. To refuse older lives of gateways over restarts of your program too, keep
- * `lives`, and begin with them. 20 kB. */
+/* State of a reader with the key. Start with all bytes 0. To refuse older runs of gateways after a restart of your program,
+ * too, save `runs`, and start with them. 20 kB. */
 struct scanhub_guard {
-    struct scanhub_life lives[SCANHUB_HUBS];
-    uint8_t life_count, stream_count;
+    struct scanhub_run runs[SCANHUB_HUBS];
+    uint8_t run_count, stream_count;
     struct scanhub_stream streams[SCANHUB_STREAMS];
 };
 
@@ -259,16 +259,16 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
                                                      uint64_t wall_ns)
 {
     struct scanhub_announce announce;
-    struct scanhub_life *life = guard->lives;
+    struct scanhub_run *run = guard->runs;
     struct scanhub_stream *stream;
     uint64_t hub = datagram->hub;
     enum scanhub_result result;
     unsigned i, kept;
     int is_announce = datagram->topic == SCANHUB_ANNOUNCE, is_next;
-    while (life < guard->lives + guard->life_count && life->hub != hub)
-        life++;
-    is_next = life == guard->lives + guard->life_count || life->epoch < datagram->epoch;
-    if (!is_next && life->epoch > datagram->epoch)
+    while (run < guard->runs + guard->run_count && run->hub != hub)
+        run++;
+    is_next = run == guard->runs + guard->run_count || run->epoch < datagram->epoch;
+    if (!is_next && run->epoch > datagram->epoch)
         return SCANHUB_EPOCH;
     stream = is_next ? NULL : scanhub_guard_find(guard, hub, datagram->sensor, SCANHUB_ANNOUNCE);
     if (!stream) {
@@ -284,9 +284,9 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
     if (result != SCANHUB_OK)
         return result;
     if (is_next) {
-        if (life == guard->lives + SCANHUB_HUBS)
+        if (run == guard->runs + SCANHUB_HUBS)
             return SCANHUB_CAPACITY;
-        /* Of its older life nothing is believed any more. */
+        /* The gateway's older runs are refused from now on. */
         for (i = kept = 0; i < guard->stream_count; i++)
             if (guard->streams[i].hub != hub)
                 guard->streams[kept++] = guard->streams[i];
@@ -295,10 +295,10 @@ static inline enum scanhub_result scanhub_guard_take(struct scanhub_guard *guard
     stream = scanhub_guard_begin(guard, hub, datagram->sensor, SCANHUB_ANNOUNCE, datagram->sequence);
     if (!stream)
         return SCANHUB_CAPACITY;
-    if (life == guard->lives + guard->life_count)
-        guard->life_count++;
-    life->hub = hub;
-    life->epoch = datagram->epoch;
+    if (run == guard->runs + guard->run_count)
+        guard->run_count++;
+    run->hub = hub;
+    run->epoch = datagram->epoch;
     result = scanhub_stream_take(stream, datagram->sequence, 1);
     for (i = 0; result == SCANHUB_OK && i < announce.count; i++) {
         struct scanhub_announced announced = scanhub_announced(&announce, i);

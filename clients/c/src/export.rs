@@ -159,8 +159,8 @@ pub extern "C" fn scanhub_unpublish(publication: *mut Opaque) -> c_int {
 
 /// Returns 1 if a hub runs, and 0 otherwise.
 #[unsafe(no_mangle)]
-pub extern "C" fn scanhub_hub_lives(handle: *mut Opaque) -> c_int {
-    answer(|| with(handle, |handle: &mut Handle| Ok(handle.hub_lives().into())))
+pub extern "C" fn scanhub_hub_is_running(handle: *mut Opaque) -> c_int {
+    answer(|| with(handle, |handle: &mut Handle| Ok(handle.hub_is_running().into())))
 }
 
 /// Sets the time since the last sample, in ns. Returns 0.

@@ -123,7 +123,7 @@ macro_rules! topics {
                 }
             }
 
-            fn hub_lives(&mut self) -> bool {
+            fn hub_is_running(&mut self) -> bool {
                 match self {
                     Source::Robot(robot) => robot.subscriber_mut().hub_is_running(),
                     $(Source::$topic(topic) => topic.subscriber_mut().hub_is_running(),)*
@@ -267,8 +267,8 @@ impl Handle {
     }
 
     /// Returns whether a hub runs in the domain, as [`Subscriber::hub_is_running`] does.
-    pub(crate) fn hub_lives(&mut self) -> bool {
-        self.source.hub_lives()
+    pub(crate) fn hub_is_running(&mut self) -> bool {
+        self.source.hub_is_running()
     }
 
     /// Returns the time since the last sample, as [`Subscriber::silent_for`] does.

@@ -8,7 +8,7 @@ mod silence;
 
 pub use boundary::Lent;
 pub use export::{
-    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_open_robot,
+    scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_is_running, scanhub_open, scanhub_open_robot,
     scanhub_open_robot_early, scanhub_publish_tilt, scanhub_release, scanhub_send_tilt, scanhub_sensors,
     scanhub_silent_for, scanhub_take, scanhub_topics, scanhub_unpublish, scanhub_version, scanhub_wait,
     scanhub_why_silent,

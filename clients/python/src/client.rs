@@ -157,7 +157,7 @@ pub(crate) trait Follow: Sized + Send {
     fn has_left(&self) -> bool;
 
     /// Returns whether a hub or listener publishes in the domain, as of the last look.
-    fn hub_lives(&self) -> bool;
+    fn hub_is_running(&self) -> bool;
 
     /// Returns the time since the last sample; if there was none, since the start. Time in suspend counts.
     fn silent_for(&self) -> Duration;
@@ -391,7 +391,7 @@ impl Follow for Topics {
         self.descriptor.as_ref().map(|descriptor| descriptor.as_raw_fd()).ok_or_else(Error::mixed)
     }
 
-    fn hub_lives(&self) -> bool {
+    fn hub_is_running(&self) -> bool {
         self.session.domain().is_some()
     }
 
@@ -554,7 +554,7 @@ impl Follow for Verdicts {
         self.pollable.as_ref().map(AsRawFd::as_raw_fd).ok_or_else(Error::mixed)
     }
 
-    fn hub_lives(&self) -> bool {
+    fn hub_is_running(&self) -> bool {
         match &self.pollable {
             Some(pollable) => pollable.hub_is_running(),
             None => self.robot.as_ref().is_some_and(RobotSubscriber::hub_is_running),

@@ -37,8 +37,8 @@ fn _scanhub(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.setattr("_sources", env!("SCANHUB_SOURCES"))?;
     module.add_class::<Sample>()?;
     topics::add_to(module)?;
-    module.add_class::<subscription::Subscription>()?;
-    module.add_class::<subscription::RobotFollower>()?;
+    module.add_class::<subscription::Subscriber>()?;
+    module.add_class::<subscription::RobotSubscriber>()?;
     module.add_class::<recording::Recording>()?;
     module.add_class::<Publication>()?;
     module.add_function(wrap_pyfunction!(sample::restore, module)?)?;

@@ -114,9 +114,9 @@ macro_rules! follower {
 
             /// Whether a hub or listener publishes in the domain, as of the last look.
             #[getter]
-            fn hub_lives(&self, py: Python<'_>) -> bool {
+            fn hub_is_running(&self, py: Python<'_>) -> bool {
                 // A thread that waits has the lock for a tenth of a second.
-                py.detach(|| self.source.with(|source| source.hub_lives())).unwrap_or_default()
+                py.detach(|| self.source.with(|source| source.hub_is_running())).unwrap_or_default()
             }
 
             /// Seconds since the last sample; if there was none, since the start. Time in suspend counts.
@@ -161,14 +161,14 @@ macro_rules! follower {
 
 /// Subscription to topics. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
-pub(crate) struct Subscription {
+pub(crate) struct Subscriber {
     source: Arc<Confined<Topics>>,
     timeout: Option<f64>,
     notice: Option<Py<PyAny>>,
 }
 
 follower! {
-    Subscription, |py, sample| topics::wrap(py, sample);
+    Subscriber, |py, sample| topics::wrap(py, sample);
 
     #[new]
     fn new(
@@ -177,7 +177,7 @@ follower! {
         root: Option<PathBuf>,
         timeout: Option<f64>,
         on_notice: Option<Py<PyAny>>,
-    ) -> PyResult<Subscription> {
+    ) -> PyResult<Subscriber> {
         let mut unique = Vec::new();
         for name in &names {
             let name = parse(name)?;
@@ -189,20 +189,20 @@ follower! {
             return Err(Error::new("NoTopic", "no topic is named", "write SENSOR/TOPIC, as front/scan").into());
         }
         let source = Arc::new(Confined::new(Topics::new(unique, &Place { domain, root })?));
-        Ok(Subscription { source, timeout, notice: on_notice })
+        Ok(Subscriber { source, timeout, notice: on_notice })
     }
 }
 
 /// Subscription to the verdict of a robot. Iterate over it, with `for` or with `async for`.
 #[pyclass(subclass, frozen, module = "scanhub._scanhub")]
-pub(crate) struct RobotFollower {
+pub(crate) struct RobotSubscriber {
     source: Arc<Confined<Verdicts>>,
     timeout: Option<f64>,
     notice: Option<Py<PyAny>>,
 }
 
 follower! {
-    RobotFollower, |py, verdict| robot(py, verdict);
+    RobotSubscriber, |py, verdict| robot(py, verdict);
 
     #[new]
     fn new(
@@ -210,10 +210,10 @@ follower! {
         domain: Option<String>,
         root: Option<PathBuf>,
         early: bool,
-    ) -> PyResult<RobotFollower> {
+    ) -> PyResult<RobotSubscriber> {
         let sensors: Vec<&str> = sensors.iter().map(String::as_str).collect();
         let verdicts = Verdicts::new(&sensors, &Place { domain, root }, early)?;
-        Ok(RobotFollower { source: Arc::new(Confined::new(verdicts)), timeout: None, notice: None })
+        Ok(RobotSubscriber { source: Arc::new(Confined::new(verdicts)), timeout: None, notice: None })
     }
 
     /// Returns what is known now. Never waits.

@@ -11,7 +11,7 @@ async def follow() -> None:
         raise AssertionError("the layout differs")
 
 
-def subscribe() -> scanhub.Subscription:
+def subscribe() -> scanhub.Subscriber:
     return scanhub.subscribe("front/scan", domain=domain, root=root, timeout=20)
 
 

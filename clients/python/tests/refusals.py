@@ -173,7 +173,7 @@ def warning(what) -> str:
 
 
 def warnings_in_asyncio() -> None:
-    async def follow(silent: "scanhub.Subscription | scanhub.RobotFollower") -> None:
+    async def follow(silent: "scanhub.Subscriber | scanhub.RobotSubscriber") -> None:
         with silent:
             async for _ in silent:
                 pass

@@ -43,7 +43,7 @@ def refuses(error: type, what) -> str:
     raise AssertionError(f"{error} was not raised")
 
 
-def subscribe(*topics: str, timeout: float = 20.0, **options: Any) -> scanhub.Subscription:
+def subscribe(*topics: str, timeout: float = 20.0, **options: Any) -> scanhub.Subscriber:
     return scanhub.subscribe(*topics, domain=domain, root=root, timeout=timeout, **options)
 
 
@@ -54,21 +54,21 @@ def until(is_done: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def views_are_the_hubs_memory(scans: scanhub.Subscription) -> None:
+def views_are_the_hubs_memory(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
     for array in (scan.ranges, scan.upper, scan.intensities):
         assert array.size == 361 and lies_in_shared_memory(array)
     assert not lies_in_shared_memory(scan.ranges_m) and not lies_in_shared_memory(scan.copy().ranges)
 
 
-def views_cannot_be_written(scans: scanhub.Subscription) -> None:
+def views_cannot_be_written(scans: scanhub.Subscriber) -> None:
     ranges = next(scans).ranges
     refuses(ValueError, lambda: ranges.__setitem__(0, 0))
     refuses(ValueError, lambda: ranges.setflags(write=True))
     refuses(ValueError, lambda: ranges[5:].setflags(write=True))
 
 
-def a_view_keeps_its_sample(scans: scanhub.Subscription) -> None:
+def a_view_keeps_its_sample(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
     kept, before = scan.ranges[100:200], scan.ranges[100:200].copy()
     seq = scan.topic_seq
@@ -81,7 +81,7 @@ def a_view_keeps_its_sample(scans: scanhub.Subscription) -> None:
     assert np.array_equal(kept, before)
 
 
-def four_may_be_kept_and_no_more(scans: scanhub.Subscription) -> None:
+def four_may_be_kept_and_no_more(scans: scanhub.Subscriber) -> None:
     kept = [next(scans).ranges for _ in range(4)]
     said = refuses(scanhub.Held, lambda: next(scans))
     assert "front/scan" in said and "copy()" in said, said
@@ -92,7 +92,7 @@ def four_may_be_kept_and_no_more(scans: scanhub.Subscription) -> None:
     assert len({copy.topic_seq for copy in copies}) == len(copies)
 
 
-def other_threads_run_meanwhile(scans: scanhub.Subscription) -> None:
+def other_threads_run_meanwhile(scans: scanhub.Subscriber) -> None:
     turns, is_over = [0], threading.Event()
 
     def turn() -> None:
@@ -116,7 +116,7 @@ def other_threads_run_meanwhile(scans: scanhub.Subscription) -> None:
     thread.join()
 
 
-def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscription) -> None:
+def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
     kept, before = scan.ranges, scan.ranges.copy()
     child = os.fork()
@@ -130,14 +130,14 @@ def a_child_takes_nothing_from_its_parent(scans: scanhub.Subscription) -> None:
     assert np.array_equal(kept, before)
 
 
-def what_is_closed_ends(scans: scanhub.Subscription) -> None:
+def what_is_closed_ends(scans: scanhub.Subscriber) -> None:
     with scans:
         scan = next(scans)
         kept, before = scan.ranges, scan.ranges.copy()
     assert list(scans) == [] and np.array_equal(kept, before)
 
 
-def copies_can_be_pickled_and_views_cannot(scans: scanhub.Subscription) -> None:
+def copies_can_be_pickled_and_views_cannot(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
     said = refuses(TypeError, lambda: pickle.dumps(scan))
     assert "copy()" in said, said
@@ -148,7 +148,7 @@ def copies_can_be_pickled_and_views_cannot(scans: scanhub.Subscription) -> None:
         refuses(ValueError, lambda: scanhub._scanhub._restore("front", "marks", bytes(64), broken, (0, False, False)))
 
 
-def other_threads_drop_samples(scans: scanhub.Subscription) -> None:
+def other_threads_drop_samples(scans: scanhub.Subscriber) -> None:
     for _ in range(5):
         kept = [next(scans) for _ in range(4)]
         views = [scan.ranges for scan in kept]
@@ -160,7 +160,7 @@ def other_threads_drop_samples(scans: scanhub.Subscription) -> None:
         kept.clear()
 
 
-def a_sample_is_dropped_while_another_thread_waits(_: scanhub.Subscription) -> None:
+def a_sample_is_dropped_while_another_thread_waits(_: scanhub.Subscriber) -> None:
     def has_subscriber() -> bool:
         assert tilts._poll() is None
         return mount.subscribers == 1
@@ -185,7 +185,7 @@ def a_sample_is_dropped_while_another_thread_waits(_: scanhub.Subscription) -> N
         kept = [sent(angle_rad) for angle_rad in (5.0, 6.0, 7.0, 8.0)]
 
 
-def two_threads_at_a_time_are_refused(scans: scanhub.Subscription) -> None:
+def two_threads_at_a_time_are_refused(scans: scanhub.Subscriber) -> None:
     waits, may_continue, refused = threading.Event(), threading.Event(), []
 
     def notice(_: str) -> None:
@@ -209,7 +209,7 @@ def two_threads_at_a_time_are_refused(scans: scanhub.Subscription) -> None:
     assert refused[1:] == ["front"], refused
 
 
-def ctrl_c_ends_a_wait(_: scanhub.Subscription) -> None:
+def ctrl_c_ends_a_wait(_: scanhub.Subscriber) -> None:
     nothing = scanhub.subscribe("nobody/scan", domain=domain, root=root)
     took = []
     for _ in range(5):
@@ -222,7 +222,7 @@ def ctrl_c_ends_a_wait(_: scanhub.Subscription) -> None:
     assert min(took) < 0.2, took
 
 
-def asyncio_waits_without_a_thread(_: scanhub.Subscription) -> None:
+def asyncio_waits_without_a_thread(_: scanhub.Subscriber) -> None:
     async def follow() -> None:
         scans = scanhub.subscribe("front/scan", "front/zones", domain=domain, root=root, timeout=20)
         threads, seen, canceled, last = threading.active_count(), 0, 0, None
@@ -253,7 +253,7 @@ def asyncio_waits_without_a_thread(_: scanhub.Subscription) -> None:
     run(follow())
 
 
-def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
+def a_close_ends_the_wait_of_a_task(_: scanhub.Subscriber) -> None:
     async def follow() -> None:
         for in_thread in (False, True):
             waits: list[Any] = [
@@ -284,7 +284,7 @@ def a_close_ends_the_wait_of_a_task(_: scanhub.Subscription) -> None:
     run(follow())
 
 
-def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
+def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscriber) -> None:
     next(scans)
 
     async def follow() -> None:
@@ -295,7 +295,7 @@ def a_subscription_has_one_kind_of_loop(scans: scanhub.Subscription) -> None:
     assert "async for" in said, said
 
 
-def a_child_of_multiprocessing_takes_nothing(scans: scanhub.Subscription) -> None:
+def a_child_of_multiprocessing_takes_nothing(scans: scanhub.Subscriber) -> None:
     scan = next(scans)
     kept, before = scan.ranges, scan.ranges.copy()
     children = multiprocessing.get_context("fork")
@@ -309,7 +309,7 @@ def a_child_of_multiprocessing_takes_nothing(scans: scanhub.Subscription) -> Non
     assert np.array_equal(kept, before)
 
 
-def a_child_is_refused(scans: scanhub.Subscription) -> None:
+def a_child_is_refused(scans: scanhub.Subscriber) -> None:
     next(scans)
     child = os.fork()
     if child == 0:

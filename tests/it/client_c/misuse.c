@@ -65,7 +65,7 @@ static void refused_as_a_handle(struct scanhub_attachment *handle)
     MUST(scanhub_wait(handle, 0) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_take(handle, &sample) == SCANHUB_REFUSED_ARGUMENT);
     MUST(sample.header == NULL && sample.payload == NULL && scanhub_release(&sample) == 0);
-    MUST(scanhub_hub_lives(handle) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_hub_is_running(handle) == SCANHUB_REFUSED_ARGUMENT);
     uint64_t silent_ns = 1;
     MUST(scanhub_silent_for(handle, &silent_ns) == SCANHUB_REFUSED_ARGUMENT && silent_ns == 0);
     const char *text = NULL;
@@ -278,7 +278,7 @@ static void samples(const char *sensor)
         MUST(scanhub_take(handle, &lent[i]) == 1 && lent[i].length == sizeof(struct scanhub_scan_v2) + 3 * 361);
         MUST(i == 0 || lent[i].header->topic_seq == lent[i - 1].header->topic_seq + 1 + lent[i].missed);
     }
-    MUST(scanhub_hub_lives(handle) == 1);
+    MUST(scanhub_hub_is_running(handle) == 1);
     MUST(scanhub_take(handle, &fifth) == SCANHUB_REFUSED_ARGUMENT);
     SAYS("four samples");
     copy = lent[1];

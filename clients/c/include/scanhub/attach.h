@@ -653,7 +653,7 @@ int scanhub_release(struct scanhub_sample *sample);
 int scanhub_close(struct scanhub_attachment *handle);
 
 /* 1 if a hub runs in the domain, 0 if not, as of the last call that found no sample. */
-int scanhub_hub_lives(struct scanhub_attachment *handle);
+int scanhub_hub_is_running(struct scanhub_attachment *handle);
 
 /*
  * Sets *silent_ns to the nanoseconds since the last sample; if there was none, since scanhub_open: 0. Time during which

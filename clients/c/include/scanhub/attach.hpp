@@ -169,8 +169,8 @@ public:
 #endif
     /* As scanhub_fd. */
     int fd() { return check(scanhub_fd(handle_)); }
-    /* As scanhub_hub_lives. */
-    bool hub_lives() { return check(scanhub_hub_lives(handle_)) == 1; }
+    /* As scanhub_hub_is_running. */
+    bool hub_is_running() { return check(scanhub_hub_is_running(handle_)) == 1; }
     /* The time since the last sample, as scanhub_silent_for. */
     std::chrono::nanoseconds silent_for()
     {

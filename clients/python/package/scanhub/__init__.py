@@ -106,7 +106,7 @@ __all__ = [
     "RecordingWarning",
     "Refused",
     "Robot",
-    "RobotFollower",
+    "RobotSubscriber",
     "Sample",
     "Scan",
     "Scans",
@@ -118,7 +118,7 @@ __all__ = [
     "Site",
     "Status",
     "Step",
-    "Subscription",
+    "Subscriber",
     "Taken",
     "Telegram",
     "Tilt",
@@ -154,7 +154,7 @@ Shown = Background
 """A background model that the hub sends on request."""
 
 
-async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any:
+async def _next(follower: _scanhub.Subscriber | _scanhub.RobotSubscriber) -> Any:
     """Waits for the next item. A task that is canceled meanwhile loses none: each is received just before the return."""
     loop = asyncio.get_running_loop()
     if follower in _waiting:
@@ -174,7 +174,7 @@ async def _next(follower: _scanhub.Subscription | _scanhub.RobotFollower) -> Any
     raise StopAsyncIteration
 
 
-_Follower = Union[_scanhub.Subscription, _scanhub.RobotFollower]
+_Follower = Union[_scanhub.Subscriber, _scanhub.RobotSubscriber]
 _Waiting = Tuple[asyncio.AbstractEventLoop, int, Callable[[], None]]
 _waiting: weakref.WeakKeyDictionary[_Follower, _Waiting] = weakref.WeakKeyDictionary()
 """For each object for which a task waits: the loop, the descriptor in it, and the function that ends the wait."""
@@ -225,11 +225,11 @@ def _close(follower: _Follower, close: Callable[[], None]) -> None:
     close()
 
 
-class Subscription(_scanhub.Subscription):
+class Subscriber(_scanhub.Subscriber):
     """Iterates over the samples of its topics, with `for` or with `async for`. Made by `scanhub.subscribe`. The iteration ends
     only if the subscription is closed."""
 
-    def __aiter__(self) -> Subscription:
+    def __aiter__(self) -> Subscriber:
         return self
 
     async def __anext__(self) -> Any:
@@ -239,18 +239,18 @@ class Subscription(_scanhub.Subscription):
         """Leaves the domain. Samples that the program keeps stay readable."""
         _close(self, super().close)
 
-    def __enter__(self) -> Subscription:
+    def __enter__(self) -> Subscriber:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class RobotFollower(_scanhub.RobotFollower):
+class RobotSubscriber(_scanhub.RobotSubscriber):
     """Iterates over the verdicts of the robot, with `for` or with `async for`. Made by `scanhub.robot`. The iteration ends only
     if it is closed."""
 
-    def __aiter__(self) -> RobotFollower:
+    def __aiter__(self) -> RobotSubscriber:
         return self
 
     async def __anext__(self) -> Robot:
@@ -261,7 +261,7 @@ class RobotFollower(_scanhub.RobotFollower):
         """Leaves the domain."""
         _close(self, super().close)
 
-    def __enter__(self) -> RobotFollower:
+    def __enter__(self) -> RobotSubscriber:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -274,19 +274,19 @@ def subscribe(
     root: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     on_notice: Callable[[str], object] | None = None,
-) -> Subscription:
+) -> Subscriber:
     """Subscribes to `topics`, each `SENSOR/TOPIC` as in `front/scan`, in `domain` (None: the value of SCANHUB_DOMAIN, or
     `scanhub`) below the directory `root` (None: all locations in which a hub may be).
 
     Iterate over the result. With `timeout`, a silence of this number of seconds raises NoHub or Silent. `on_notice` is called
     with `hub_gone` and `hub_back`. Raises NoTopic or Impossible if a name is invalid.
     """
-    return Subscription(topics, domain, root, timeout, on_notice)
+    return Subscriber(topics, domain, root, timeout, on_notice)
 
 
 def robot(
     *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
-) -> RobotFollower:
+) -> RobotSubscriber:
     """Follows the verdict over the zones of `sensors`. Without names, it follows all sensors of the hub; in a domain without
     a hub, those of other machines that are published there. With `early`, the verdict becomes worse before a scan is complete,
     and better again if the warning is withdrawn.
@@ -294,7 +294,7 @@ def robot(
     Iterate over the result, or call `now()` in a loop of your own. The verdict becomes `unknown` if no recent data arrives.
     Raises Impossible if a name is invalid.
     """
-    return RobotFollower(sensors, domain, root, early)
+    return RobotSubscriber(sensors, domain, root, early)
 
 
 def publish(

@@ -31,8 +31,8 @@ __all__ = [
     "Tilt",
     "Cloud",
     "Obstacles",
-    "Subscription",
-    "RobotFollower",
+    "Subscriber",
+    "RobotSubscriber",
     "Recording",
     "Publication",
     "_restore",
@@ -357,7 +357,7 @@ class Obstacles(Sample):
     def obstacles(self) -> tuple[Obstacle, ...]: ...
 
 @disjoint_base
-class Subscription:
+class Subscriber:
     def __new__(
         cls,
         names: Sequence[str],
@@ -371,7 +371,7 @@ class Subscription:
     def close(self) -> None: ...
     def silent_for(self) -> float: ...
     @property
-    def hub_lives(self) -> bool: ...
+    def hub_is_running(self) -> bool: ...
     @property
     def _warning_due(self) -> float | None: ...
     @property
@@ -383,7 +383,7 @@ class Subscription:
     def _silence(self) -> Failure: ...
 
 @disjoint_base
-class RobotFollower:
+class RobotSubscriber:
     def __new__(
         cls, sensors: Sequence[str], domain: str | None, root: str | PathLike[str] | None, early: bool
     ) -> Self: ...
@@ -393,7 +393,7 @@ class RobotFollower:
     def close(self) -> None: ...
     def silent_for(self) -> float: ...
     @property
-    def hub_lives(self) -> bool: ...
+    def hub_is_running(self) -> bool: ...
     @property
     def _warning_due(self) -> float | None: ...
     @property
