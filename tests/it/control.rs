@@ -63,7 +63,7 @@ fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
     let [telegrams, scans, others] = consumers.map(|consumer| consumer.end(INT));
     for (outcome, class) in [(&telegrams, "telegram"), (&scans, "scan"), (&others, "scan")] {
         sequence(&outcome.of_class(class), "topic_seq");
-        assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+        assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
     }
     sequence(&telegrams.of_class("telegram"), "seq");
     assert_eq!(hub.end(TERM).code, Some(0));

@@ -47,7 +47,7 @@ fn interrupted_consumers_say_what_they_received() {
             assert_eq!(outcome.code, Some(code), "{}", outcome.errors);
             let (lines, scans) = (outcome.lines(), outcome.of_class("scan").len() as u64);
             let end: Vec<_> = lines.iter().skip_while(|line| line["class"] != "summary").collect();
-            assert_eq!((end[0]["received"].as_u64(), &end[0]["lost"]), (Some(scans), &0.into()));
+            assert_eq!((end[0]["received"].as_u64(), &end[0]["missed"]), (Some(scans), &0.into()));
             let error = end.get(1).map(|line| line["kind"].as_str());
             assert_eq!(error, (code == 130).then_some(Some("interrupted")));
         }

@@ -133,7 +133,7 @@ fn what_a_full_queue_drops_is_counted() {
         assert_eq!(failing["to"], "ours");
         await_growth(&mut gateway, "send_failed");
         assert!(succeeds(Command::new("tc").args(["qdisc", "del", "dev", "ours", "root"])));
-        await_state(&mut gateway, "well");
+        await_state(&mut gateway, "recovered");
         await_growth(&mut gateway, "sent");
         let outcome = gateway.end(TERM);
         is_gap_free(&receiver.finish(), &outcome);

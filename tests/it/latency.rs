@@ -42,7 +42,7 @@ fn ages_of_a_stream_are_split_and_judged() {
         let all = conditions["realtime"] == true && conditions["memory_locked"] == true;
         assert_eq!(conditions["refused"] == json!([]), all, "what is missing is explained: {conditions}");
         let line = told(&outcome);
-        assert_eq!((number(&line, "received"), number(&line, "ahead")), (20, 0), "{line}");
+        assert_eq!((number(&line, "received"), number(&line, "in_future")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
         // On a busy machine, a header cannot hold the time that a sample took in the hub.
@@ -116,11 +116,11 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         assert_eq!((&line["line"], &line["hub"]), (&Value::Null, &Value::Null));
         // What the listener says itself came over no network.
         assert!((1..=count(&line, "age")).contains(&count(&line, "network")), "{line}");
-        assert_eq!(number(&line, "ahead"), 0, "{line}");
+        assert_eq!(number(&line, "in_future"), 0, "{line}");
         // Its clock goes ahead of ours.
         sender.stamp_ns = testkit::wall_ns() + 3_600_000_000_000;
         sender.send(Topic::Zones, &zones);
-        let line = latency.await_line("clocks that differ", |line| line["ahead"] == 1);
+        let line = latency.await_line("clocks that differ", |line| line["in_future"] == 1);
         assert!(count(&line, "age") > count(&line, "network"), "{line}");
         assert_eq!(latency.end(INT).code, Some(0));
         assert_eq!(listener.end(TERM).code, Some(0));

@@ -179,7 +179,7 @@ fn a_diode_that_is_unplugged_is_told_and_the_others_go_on() {
     assert_eq!(fs::read_to_string(diodes.0.join("rd/brightness")).unwrap(), "255\n", "the stop light");
     diodes.plug("gn");
     let back = leds.await_line("its return", |line| line["class"] == "led");
-    assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"back".into()));
+    assert_eq!((&back["name"], &back["state"]), (&"gn".into(), &"recovered".into()));
     assert_eq!(diodes.lit().as_deref(), Some("rd"));
     let _sensor = simulator(&env, &world(&env, "open", STRIP));
     diodes.await_lit("gn mk");

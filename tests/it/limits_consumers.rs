@@ -145,10 +145,10 @@ fn a_stopped_consumer_knows_what_it_missed_and_nobody_else_misses_anything() {
     let at = |scan: &Value| number(scan, "topic_seq");
     let published = at(&scans[scans.len() - 1]) - at(&scans[0]) + 1;
     let told: u64 = notices.iter().map(|notice| number(notice, "missed")).sum();
-    assert_eq!((number(summary, "received"), number(summary, "lost")), (scans.len() as u64, told));
+    assert_eq!((number(summary, "received"), number(summary, "missed")), (scans.len() as u64, told));
     assert_eq!(scans.len() as u64 + told, published);
     sequence(&other.of_class("scan"), "topic_seq");
-    assert_eq!(other.of_class("summary")[0]["lost"], 0);
+    assert_eq!(other.of_class("summary")[0]["missed"], 0);
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
@@ -180,7 +180,7 @@ fn killed_consumers_that_held_samples_leave_nothing() {
     assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
     let outcome = echo.end(INT);
     sequence(&outcome.of_class("scan"), "topic_seq");
-    assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+    assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
     assert_eq!(hub.end(TERM).code, Some(0));
     assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
 }

@@ -116,7 +116,7 @@ fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     let outcome = served.end(INT);
     sequence(&outcome.of_class("scan"), "topic_seq");
     let summaries = outcome.of_class("summary");
-    assert!(summaries.iter().all(|summary| number(summary, "lost") == 0), "{summaries:?}");
+    assert!(summaries.iter().all(|summary| number(summary, "missed") == 0), "{summaries:?}");
     let outcome = hub.end(TERM);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("attached but get nothing"), "{outcome}");

@@ -145,7 +145,7 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
         }
         let outcome = scans.end(INT);
         sequence(&outcome.of_class("scan"), "topic_seq");
-        assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+        assert_eq!(outcome.of_class("summary")[0]["missed"], 0);
         assert_eq!(env.info("front")["counters"]["loan_failed"], 0);
         assert_eq!(hub.end(TERM).code, Some(0));
     });

@@ -49,7 +49,7 @@ fn a_line_that_loses_is_seen_everywhere() {
     let line = consumer.await_line("a rate with losses", |line| {
         line["class"] == "hz" && line["lost_on_line"].as_u64() > Some(50)
     });
-    assert!(line["lost"] == 0 && line["damaged"].as_f64() > Some(0.3), "{line}");
+    assert!(line["missed"] == 0 && line["damaged"].as_f64() > Some(0.3), "{line}");
     let outcome = consumer.end(INT);
     let [summary] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
     assert!(summary["lost_on_line"].as_u64() > Some(50), "{summary}");

@@ -299,10 +299,10 @@ fn a_gateway_that_starts_again_and_a_second_hub_are_told_apart() {
 #[test]
 fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
     in_a_network("listen::a_gateway_that_starts_ever_again_stays_heard_and_accounted_for", || {
-        const LIVES: u64 = 90;
+        const RUNS: u64 = 90;
         let env = TestEnv::new();
         let mut program = listener(&env, &["--topic=zones"]);
-        for epoch in 1..=LIVES {
+        for epoch in 1..=RUNS {
             let mut sender = Sender::new(HUB, epoch as u32, 0, "front");
             sender.announce(&[Topic::Zones]);
             sender.send(Topic::Zones, &zones(Verdict::Clear));
@@ -313,11 +313,11 @@ fn a_gateway_that_starts_ever_again_stays_heard_and_accounted_for() {
         let outcome = program.end(INT);
         let lines = outcome.of_class("lan");
         assert_eq!(lines.len(), 2 * 64, "{outcome}");
-        let given_up = &outcome.of_class("lan_given_up")[0];
-        assert_eq!(given_up["lives"], LIVES - 64, "{outcome}");
-        let sum = |key| number(given_up, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
+        let evicted = &outcome.of_class("lan_evicted")[0];
+        assert_eq!(evicted["runs"], RUNS - 64, "{outcome}");
+        let sum = |key| number(evicted, key) + lines.iter().map(|line| number(line, key)).sum::<u64>();
         // An announcement, and of four zones the first and the last.
-        assert_eq!((sum("received"), sum("lost")), (3 * LIVES, 2 * LIVES), "{outcome}");
+        assert_eq!((sum("received"), sum("lost")), (3 * RUNS, 2 * RUNS), "{outcome}");
         assert_eq!(refused(&outcome)["capacity"], 0, "{outcome}");
         assert!(outcome.of_class("notice").iter().all(|line| line["kind"] == "missed"), "{outcome}");
     });

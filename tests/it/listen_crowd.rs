@@ -82,8 +82,8 @@ fn a_true_gateway_is_heard_at_once_after_64_invented_ones() {
             let outcome = program.end(INT);
             let capacity = number(&outcome.of_class("lan_refused")[0], "capacity");
             assert_eq!((told(&outcome), capacity), (1, u64::from(is_delivered)), "{outcome}");
-            let sums = &outcome.of_class("lan_given_up")[0];
-            assert_eq!((&sums["lives"], &sums["displaced"]), (&json!(1), &json!(1)), "{outcome}");
+            let sums = &outcome.of_class("lan_evicted")[0];
+            assert_eq!((&sums["runs"], &sums["evicted_active"]), (&json!(1), &json!(1)), "{outcome}");
         }
     });
 }
@@ -115,7 +115,7 @@ fn a_flood_of_invented_gateways_puts_out_none_that_delivers() {
         let outcome = program.end(INT);
         let row = zones_row(&outcome, "5f3a12bc00d1e2f3");
         assert_eq!((number(&row, "received"), number(&row, "lost")), (TURNS + 2, 0), "{row}");
-        assert!(number(&outcome.of_class("lan_given_up")[0], "displaced") > 1000, "{outcome}");
+        assert!(number(&outcome.of_class("lan_evicted")[0], "evicted_active") > 1000, "{outcome}");
         assert_eq!(told(&outcome), 1, "4000 of them, one line");
     });
 }
@@ -180,7 +180,7 @@ fn a_published_sensor_that_delivers_is_not_put_out() {
             await_verdict(&mut sender, &mut echo, if turn % 2 == 0 { Verdict::Stop } else { Verdict::Slow });
         }
         let echoed = echo.end(INT);
-        assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
+        assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         let outcome = program.end(INT);
         let line = &outcome.of_class("lan_published")[0];
         assert!(line["sensors"].to_string().contains("robot1.front"), "{line}");

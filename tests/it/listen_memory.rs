@@ -76,7 +76,7 @@ fn invented_sensors_stay_within_the_memory() {
         assert!(most > 4 << 20 && most < MEGABYTES << 20, "{most} bytes");
 
         let echoed = echo.end(INT);
-        assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
+        assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         sequence(&echoed.of_class("scan"), "topic_seq");
         let outcome = program.end(INT);
         let published = outcome.of_class("lan_published").pop().expect("the counts");

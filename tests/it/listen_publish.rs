@@ -81,8 +81,8 @@ fn a_remote_sensor_is_as_a_local_one() {
         assert_eq!(outcome.of_class("telegram")[0]["data"], "02800300a00010160a");
         let summary = outcome.of_class("summary");
         let of_zones = summary.iter().find(|line| line["topic"] == "zones").expect("a summary");
-        assert_eq!((&of_zones["received"], &of_zones["lost"]), (&json!(3), &json!(3)));
-        assert_eq!(hz.end(INT).of_class("summary")[0]["lost"], 3);
+        assert_eq!((&of_zones["received"], &of_zones["missed"]), (&json!(3), &json!(3)));
+        assert_eq!(hz.end(INT).of_class("summary")[0]["missed"], 3);
 
         let info = env.await_info(FRONT, |info| info["state"] == "streaming");
         assert_eq!(info["port"], "/dev/ttyUSB7");
@@ -124,7 +124,7 @@ fn consumers_outlive_the_listener_and_see_what_they_missed() {
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         echo.await_line("zones", |line| line["verdict"] == "stop");
         let outcome = echo.end(INT);
-        assert_eq!(outcome.of_class("summary")[0]["lost"], 4, "{outcome}");
+        assert_eq!(outcome.of_class("summary")[0]["missed"], 4, "{outcome}");
         assert_eq!(second.end(TERM).code, Some(0));
         assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
     });
@@ -156,7 +156,7 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         let line = echo.await_line("the hub's next life", |line| line["boot"] == "000000000000b008");
         assert_eq!(line["topic_seq"], 7);
         let outcome = echo.end(INT);
-        assert_eq!(outcome.of_class("summary")[0]["lost"], 3, "{outcome}");
+        assert_eq!(outcome.of_class("summary")[0]["missed"], 3, "{outcome}");
         let outcome = program.end(INT);
         let unnamed = number(&outcome.of_class("lan_published")[0], "unnamed");
         assert_eq!(unnamed, 2 + u64::from(sender.proofs), "{outcome}");

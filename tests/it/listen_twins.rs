@@ -68,7 +68,7 @@ fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
         echo.await_lines(100, "scans of the first one", is_class("scan"));
         let echoed = echo.end(INT);
         assert_eq!(beams(&echoed), [361], "{echoed}");
-        assert_eq!(echoed.of_class("summary")[0]["lost"], 0, "{echoed}");
+        assert_eq!(echoed.of_class("summary")[0]["missed"], 0, "{echoed}");
         // One that comes now hears either, but not both.
         let mut late = env.start(&["listen", "--json"]).ready();
         late.await_line("that there are two", is_told);

@@ -4,6 +4,7 @@
 
 mod blocks;
 mod lines;
+mod names;
 mod program;
 mod said;
 mod shell;

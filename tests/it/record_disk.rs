@@ -44,11 +44,11 @@ fn files(outcome: &Outcome) -> Vec<PathBuf> {
     files.map(|file| PathBuf::from(file.as_str().unwrap())).collect()
 }
 
-/// No telegram was lost on the way to the recorder.
-fn nothing_lost(outcome: &Outcome) {
+/// The recorder missed no telegram.
+fn nothing_missed(outcome: &Outcome) {
     let lines = outcome.of_class("summary");
     let telegrams = lines.iter().find(|line| line["topic"] == "telegram").expect("a summary");
-    assert_eq!(number(telegrams, "lost"), 0, "{telegrams}");
+    assert_eq!(number(telegrams, "missed"), 0, "{telegrams}");
 }
 
 /// The telegrams of several files, none of which is missing or there twice.
@@ -85,7 +85,7 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
         assert_eq!(recording.notes("scanhub")[0]["part"], wanted(number + 1));
         assert_eq!(recording.notes("scanhub.life").len(), 1);
     }
-    nothing_lost(&outcome);
+    nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 20);
 }
 
@@ -146,7 +146,7 @@ fn a_file_that_may_not_grow_is_followed_by_another() {
     assert_eq!(files[..2], [env.path("walk.mcap"), env.path("walk-0002.mcap")]);
     // There is no room for the index of any but the last one.
     let recordings: Vec<_> = files.iter().map(|file| Recording::left(file)).collect();
-    nothing_lost(&outcome);
+    nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 50);
 }
 
@@ -160,17 +160,17 @@ fn a_directory_that_vanishes_is_waited_for() {
     let mut recorder = env.start(&["record", "--json", "-o", &file.display().to_string()]);
     await_samples(&mut recorder, 20);
     fs::rename(&place, env.path("unplugged")).unwrap();
-    let trouble = recorder.await_line("trouble", is_kind("disk_trouble"));
+    let trouble = recorder.await_line("trouble", is_kind("write_failed"));
     assert_eq!(trouble["file"], file.display().to_string());
     fs::create_dir(&place).unwrap();
-    recorder.await_line("well", is_kind("disk_well"));
+    recorder.await_line("well", is_kind("write_resumed"));
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     assert_eq!(files(&outcome)[1], place.join("walk-0002.mcap"));
     // What was written until it was seen is where the directory is now.
     let places = [env.path("unplugged/walk.mcap"), place.join("walk-0002.mcap")];
     let recordings = [Recording::left(&places[0]), Recording::whole(&places[1])];
-    nothing_lost(&outcome);
+    nothing_missed(&outcome);
     assert!(telegrams(&recordings).len() > 10);
 }
 
@@ -189,13 +189,13 @@ fn a_full_disk_is_waited_for() {
     let file = place.join("walk.mcap").display().to_string();
     let mut recorder =
         start_in(&env, &["unshare", "-rm", "sh", "-c", &script, "sh"], &["record", "--json", "-o", &file]);
-    recorder.await_line("trouble", is_kind("disk_trouble"));
+    recorder.await_line("trouble", is_kind("write_failed"));
     // As the recorder sees it.
     let seen = PathBuf::from(format!("/proc/{}/root{}", recorder.pid(), place.display()));
     let full = Recording::left(&seen.join("walk.mcap"));
     assert!(!full.of("front/telegram").is_empty(), "it ends behind a whole chunk");
     fs::remove_file(seen.join("filler")).unwrap();
-    recorder.await_line("well", is_kind("disk_well"));
+    recorder.await_line("well", is_kind("write_resumed"));
     let before = Recording::left(&seen.join("walk.mcap")).kept.len();
     until("it goes on", || Recording::left(&seen.join("walk.mcap")).kept.len() > before);
     // It ends with the file system that it is in.
@@ -204,7 +204,7 @@ fn a_full_disk_is_waited_for() {
     assert_eq!(files(&outcome).len(), 1);
     let mut bytes = Vec::new();
     open.read_to_end(&mut bytes).unwrap();
-    nothing_lost(&outcome);
+    nothing_missed(&outcome);
     telegrams(&[Recording::whole(Path::new(&env.file("walk.mcap", bytes)))]);
 }
 
@@ -326,12 +326,12 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
     let mut recorder = env.start(&["record", "--json", "-o", &file]);
     await_samples(&mut recorder, 20);
     fs::remove_file(&file).unwrap();
-    let gone = recorder.await_line("the loss", is_kind("file_gone"));
+    let gone = recorder.await_line("the loss", is_kind("file_removed"));
     assert_eq!(gone["file"], file);
     await_samples(&mut recorder, 20);
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
-    assert_eq!((number(&end, "gone"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
+    assert_eq!((number(&end, "removed"), number(&gone, "samples") >= 20), (number(&gone, "samples"), true));
     let next = Recording::whole(&env.path("walk-0002.mcap"));
     let repeated = 1;
     assert_eq!(number(&end, "samples") + repeated, next.kept.len() as u64, "{outcome}");
@@ -342,7 +342,7 @@ fn samples_of_a_file_that_was_removed_are_not_counted() {
     fs::remove_file(&file).unwrap();
     let outcome = recorder.end(INT);
     let end = outcome.of_class("recorded").pop().unwrap_or_else(|| panic!("{outcome}"));
-    assert!(number(&end, "gone") >= 20, "{end}");
+    assert!(number(&end, "removed") >= 20, "{end}");
 }
 
 #[test]
@@ -357,7 +357,7 @@ fn two_recorders_do_not_write_one_file() {
     assert_eq!((second.code, &error["kind"]), (Some(73), &"output".into()), "{second}");
     assert!(error["message"].as_str().unwrap().contains("another recorder writes it"), "{error}");
     await_samples(&mut recorder, 20);
-    nothing_lost(&recorder.end(INT));
+    nothing_missed(&recorder.end(INT));
     telegrams(&[Recording::whole(Path::new(&file))]);
 }
 

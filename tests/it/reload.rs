@@ -67,7 +67,7 @@ fn circles_change_in_a_stream_without_a_gap() {
         // A silence has no numbers.
         lines.retain(|line| line["topic_seq"].is_u64());
         sequence(&lines, "topic_seq");
-        assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{class}");
+        assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{class}");
     }
     // A line that arrived too late here has no circles.
     let mut verdicts = zones.of_class("zones");

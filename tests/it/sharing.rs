@@ -118,7 +118,7 @@ fn consumers_under_another_user_get_what_the_page_says() {
         assert_eq!((&scan["ranges"], &scan["wall_ns"]), (&same["ranges"], &same["wall_ns"]));
         drop(there.end(INT));
         let echoed = echo.end(INT);
-        assert_eq!((echoed.code, number(&echoed.of_class("summary")[0], "lost")), (Some(0), 0), "{echoed}");
+        assert_eq!((echoed.code, number(&echoed.of_class("summary")[0], "missed")), (Some(0), 0), "{echoed}");
         assert_eq!(listener.end(TERM).code, Some(0));
 
         // Under a name of its own.

@@ -195,7 +195,7 @@ fn shared_memory_of_strangers() {
         let mut second = env.echo(&["front/zones"]);
         second.await_line("a verdict", is_class("zones"));
         let told = env.run(&["doctor", "--json", "--no-system-config"]);
-        let told = told.lines().into_iter().find(|line| line["name"] == "strangers").expect("a finding");
+        let told = told.lines().into_iter().find(|line| line["name"] == "foreign-files").expect("a finding");
         let text = told.to_string();
         assert!(text.contains(&format!("{prefix}anything")) && text.contains("65533"), "{text}");
 

@@ -84,7 +84,11 @@ fn the_bytes_themselves_and_what_all_verbs_say_agree() {
     raw.await_bytes(40 * 732);
     let rate = env.run(&["hz", "front/scan", "--json", "-n", "60"]);
     let summary = &rate.of_class("summary")[0];
-    assert_eq!((rate.code, number(summary, "received"), number(summary, "lost")), (Some(0), 60, 0), "{rate}");
+    assert_eq!(
+        (rate.code, number(summary, "received"), number(summary, "missed")),
+        (Some(0), 60, 0),
+        "{rate}"
+    );
     let hz = summary["hz"].as_f64().unwrap_or_default();
     let listed = env.run(&["list", "--json"]).of_class("topic");
     let topics: Vec<_> = listed.iter().map(|line| (&line["topic"], &line["payload"])).collect();

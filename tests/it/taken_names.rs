@@ -59,7 +59,7 @@ fn link_waits_for_the_name_that_a_program_has() {
         }
         let [waiting, late] = [waiting, late].map(|echo| echo.end(INT));
         for outcome in [&waiting, &late] {
-            assert_eq!(outcome.of_class("summary")[0]["lost"], 0, "{outcome}");
+            assert_eq!(outcome.of_class("summary")[0]["missed"], 0, "{outcome}");
         }
         let scans = waiting.of_class("scan");
         assert_eq!(scans[0]["topic_seq"], 0, "{waiting}");

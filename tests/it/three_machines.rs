@@ -114,7 +114,7 @@ fn two_rooms_are_watched_from_a_third_machine() {
         zones.await_line("a verdict again", |line| line["class"] == "zones" && line["verdict"] != "unknown");
         let rate =
             local.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(100));
-        assert_eq!(rate["lost"], 0, "{rate}");
+        assert_eq!(rate["missed"], 0, "{rate}");
 
         for program in [near, far, zones, local, here, second] {
             drop(program.end(INT));

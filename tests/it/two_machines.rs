@@ -183,7 +183,7 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         here.await_line("a verdict", |line| line["class"] == "zones" && line["stale"] != true);
         let rate =
             hz.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(30));
-        assert_eq!(rate["lost"], 0, "{rate}");
+        assert_eq!(rate["missed"], 0, "{rate}");
         // Both ends go; who follows is told.
         drop(there.end(INT));
         assert_eq!(robot.take_hub().end(TERM).code, Some(0));

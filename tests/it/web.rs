@@ -133,7 +133,7 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
     let mut viewer = view(&host, "/", None).expect("let in");
-    server.await_line("who came", |line| line["class"] == "client" && line["came"] == true);
+    server.await_line("who came", |line| line["class"] == "viewer" && line["connected"] == true);
     assert_eq!(text(&mut viewer)["op"], "serverInfo");
     // Hostile frames come from the next viewer; this one is not to notice.
     let mut hostile = view(&host, "/", None).expect("let in");
@@ -171,7 +171,7 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
         }
     }
     drop(viewer);
-    server.await_line("who went", |line| line["class"] == "client" && line["came"] == false);
+    server.await_line("who went", |line| line["class"] == "viewer" && line["connected"] == false);
     assert_eq!(server.end(INT).code, Some(0));
 }
 

@@ -112,7 +112,7 @@ fn who_hears_the_page_is_told_names_states_and_the_verdict() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
     let words = ["SLOW", "CLEAR", "STOP"];
-    // On a busy machine, the verdict may be unknown and a sensor unheard for a moment.
+    // On a busy machine, the verdict may be unknown and a sensor without a status for a moment.
     let mut nodes = Vec::new();
     until("the tree has a verdict and a sensor that streams", || {
         nodes = tree(&mut page);

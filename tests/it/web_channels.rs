@@ -231,12 +231,12 @@ fn each_is_some_line(
     is_same: impl Fn(&Value, &Value) -> bool,
 ) {
     let (lines, summaries) = (outcome.of_class(class), outcome.of_class("summary"));
-    let lost = summaries.iter().find(|line| line["topic"] == class).map(|line| number(line, "lost"));
+    let missed = summaries.iter().find(|line| line["topic"] == class).map(|line| number(line, "missed"));
     let told: Vec<_> = heard.iter().map(|(_, body)| object(body)).filter(says_something).collect();
     assert!(!told.is_empty(), "{class}: nothing was said");
     let missing: Vec<_> = told.iter().filter(|told| !lines.iter().any(|line| is_same(told, line))).collect();
-    let may_miss = if lost == Some(0) { 0 } else { told.len() / 2 };
-    assert!(missing.len() <= may_miss, "{class}: {lost:?} lost, and no line says {missing:?}");
+    let may_miss = if missed == Some(0) { 0 } else { told.len() / 2 };
+    assert!(missing.len() <= may_miss, "{class}: {missed:?} missed, and no line says {missing:?}");
 }
 
 fn marks(told: &Value, line: &Value) -> bool {
@@ -336,7 +336,7 @@ fn compare(viewer: &Viewer, outcome: &Outcome) {
         |told| !all(told, "cylinders").is_empty(),
         zones,
     );
-    let is_heard = |told: &Value| told["state"] != "unheard";
+    let is_heard = |told: &Value| told["state"] != "no status";
     each_is_some_line("status", viewer.of("/front/status"), outcome, is_heard, status);
     let models = outcome.of_class("background");
     for (_, body) in viewer.of("/front/background") {

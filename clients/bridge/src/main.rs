@@ -236,6 +236,15 @@ mod tests {
     }
 
     #[test]
+    fn old_flag_is_an_error_that_states_the_new_one() {
+        let error =
+            Cli::try_parse_from(["scanhub-bridge", "--publish", "--consumers=3"]).expect_err("an old name");
+        let text = scanhub_verbs::with_new_name(error).to_string();
+        assert!(text.contains("'--consumers'") && text.contains("'--subscribers'"), "{text}");
+        assert_eq!(parse(&["--publish", "--subscribers=3"]).subscribers, 3);
+    }
+
+    #[test]
     fn what_scanhub_says_first_is_overridden_by_what_the_user_says() {
         let words =
             ["--domain", "scanhub", "--connect", "tcp/a:1", "--domain", "lab", "--connect", "tcp/b:1"];

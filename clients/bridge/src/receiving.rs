@@ -221,7 +221,7 @@ impl Receiving<'_> {
             let asked =
                 self.asked.iter().try_for_each(|&topic| (self.ask)(&Address { hub, sensor: &sensor, topic }));
             if let Err(failure) = asked {
-                self.asking.unasked += 1;
+                self.asking.not_requested += 1;
                 self.reception.problem(&failure.to_string())?;
             }
         }
@@ -235,7 +235,7 @@ impl Receiving<'_> {
             ("key", self.foreign + self.reception.foreign),
             ("long", count(long)),
             ("overrun", count(overrun)),
-            ("unasked", self.asking.unasked),
+            ("not_requested", self.asking.not_requested),
             ("connection", (self.refused)()),
         ];
         self.reception.tell(&others)
@@ -259,7 +259,7 @@ struct Asking {
     second: Instant,
     /// Sensors that are not queried, because there was no room or the query failed. Their announcement arrives without
     /// it.
-    unasked: u64,
+    not_requested: u64,
 }
 
 /// Maximum number of sensors that are queried in a second.
@@ -270,7 +270,7 @@ const SECOND: Duration = Duration::from_secs(1);
 
 impl Asking {
     fn new(now: Instant) -> Asking {
-        Asking { waiting: VecDeque::new(), asked: 0, second: now, unasked: 0 }
+        Asking { waiting: VecDeque::new(), asked: 0, second: now, not_requested: 0 }
     }
 
     /// Adds the sensor `name` of `hub`, which has appeared.
@@ -279,7 +279,7 @@ impl Asking {
             return;
         }
         if self.waiting.len() == WAITING_SENSORS {
-            self.unasked += 1;
+            self.not_requested += 1;
         } else {
             self.waiting.push_back((hub, name.into()));
         }
@@ -300,7 +300,7 @@ impl Asking {
 
     /// Counts all waiting sensors as not queried, at the end of the run.
     fn give_up(&mut self) {
-        self.unasked += self.waiting.drain(..).count() as u64;
+        self.not_requested += self.waiting.drain(..).count() as u64;
     }
 }
 
@@ -403,7 +403,7 @@ mod tests {
         let (told, asked) =
             run(heard, false, |key| Err(Failure::new(Kind::Failed, format!("Zenoh refuses {key}"), "")));
         assert_eq!(asked, 1);
-        assert!(told.contains("Zenoh refuses") && told.contains("\"unasked\":1"), "{told}");
+        assert!(told.contains("Zenoh refuses") && told.contains("\"not_requested\":1"), "{told}");
         assert!(told.contains("\"received\":1,"), "{told}");
     }
 
@@ -422,7 +422,10 @@ mod tests {
         assert_eq!(asked_at(&mut asking, begin), names[..64]);
         assert_eq!(asked_at(&mut asking, begin + SECOND / 2), names[..0]);
         assert_eq!(asked_at(&mut asking, begin + SECOND), names[64..128]);
-        assert_eq!((asked_at(&mut asking, begin + 2 * SECOND), asking.unasked), (names[128..].to_vec(), 0));
+        assert_eq!(
+            (asked_at(&mut asking, begin + 2 * SECOND), asking.not_requested),
+            (names[128..].to_vec(), 0)
+        );
         asking.came(5, "s0");
         assert_eq!(asked_at(&mut asking, begin + 3 * SECOND), ["s0"], "it came again");
     }
@@ -432,7 +435,7 @@ mod tests {
         let begin = Instant::now();
         let mut asking = Asking::new(begin);
         (0..10_000).for_each(|hub| asking.came(hub, "front"));
-        assert_eq!(asking.unasked, 10_000 - WAITING_SENSORS as u64);
+        assert_eq!(asking.not_requested, 10_000 - WAITING_SENSORS as u64);
         let all: usize = (0..100).map(|second| asked_at(&mut asking, begin + second * SECOND).len()).sum();
         assert_eq!(all, WAITING_SENSORS);
     }

@@ -299,7 +299,7 @@ impl<'a> Report<'a> {
     fn destination(&mut self, destination: &str, event: &DestinationEvent) -> Result<(), End> {
         match event {
             DestinationEvent::Failing(why) => self.link(destination, "failing", Some(why)),
-            DestinationEvent::Well => self.link(destination, "well", None),
+            DestinationEvent::Well => self.link(destination, "recovered", None),
         }
     }
 

@@ -211,7 +211,7 @@ impl<'a> Reception<'a> {
         }
         let (gateways, publication) = (self.incoming.gateways(), self.publication.as_ref());
         let so_far = Evictions {
-            gateways: gateways.evicted().displaced,
+            gateways: gateways.evicted().evicted_active,
             refused: gateways.refused(DatagramError::Capacity),
             sensors: publication.map_or(0, |publication| publication.displaced),
             samples: publication.map_or(0, |publication| publication.left_out.capacity),

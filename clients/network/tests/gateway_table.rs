@@ -160,7 +160,7 @@ impl Model {
         let evicted = if self.retired.is_empty() {
             let Some(other) = self.next_evicted(hub, delivers, now_ms) else { return };
             self.times.remove(&other);
-            self.evicted.displaced += 1;
+            self.evicted.evicted_active += 1;
             (other, self.active.remove(&other).unwrap())
         } else {
             self.retired.remove(0)
@@ -316,7 +316,7 @@ fn table_agrees_with_a_model_that_keeps_everything() {
         }
         full += u32::from(model.rows.len() == MAX_ROWS);
         evicted += model.evicted.runs;
-        displaced += model.evicted.displaced;
+        displaced += model.evicted.evicted_active;
         assert_eq!((figures(&table), table.evicted()), (model.figures(), model.evicted), "seed {seed}");
         for refusal in DatagramError::ALL {
             let count = model.refused.get(refusal.name()).copied().unwrap_or_default();

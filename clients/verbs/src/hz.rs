@@ -203,7 +203,7 @@ struct Line<'a> {
     min_ms: Option<f64>,
     max_ms: Option<f64>,
     received: u64,
-    lost: u64,
+    missed: u64,
     window_s: f64,
     damaged: Option<f64>,
     lost_on_line: Option<u64>,
@@ -223,7 +223,7 @@ impl<'a> Line<'a> {
             min_ms: rate.map(|rate| rate.min_ms),
             max_ms: rate.map(|rate| rate.max_ms),
             received: window.received(),
-            lost: window.lost(),
+            missed: window.missed(),
             window_s: window.span().as_secs_f64(),
             damaged: line.map(|line| line.status.damaged()),
             lost_on_line: line.and_then(LineWindow::lost_on_line),
@@ -237,7 +237,7 @@ impl<'a> Line<'a> {
             (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
                 line,
                 "{name:<16} {hz:8.2} Hz  jitter {jitter:.1} ms, interval {min:.1} to {max:.1} ms, missed {}{}",
-                self.lost,
+                self.missed,
                 self.loss.as_ref().map_or(String::new(), |loss| format!(", {loss}"))
             ),
             _ => write!(line, "{name:<16}        - Hz {} received", self.received),
@@ -288,7 +288,7 @@ impl Window {
     }
 
     /// What did not arrive between those in the window.
-    fn lost(&self) -> u64 {
+    fn missed(&self) -> u64 {
         self.arrivals.iter().map(|(_, missed)| missed).sum()
     }
 
@@ -340,7 +340,7 @@ mod tests {
             window.arrived(start + Duration::from_millis(at_ms), missed);
         }
         window.slide(start + Duration::from_millis(1200));
-        assert_eq!((window.received(), window.lost()), (4, 1));
+        assert_eq!((window.received(), window.missed()), (4, 1));
         let rate = window.rate().unwrap();
         let expected = Rate { hz: 3.0 / 0.7, jitter_ms: 124.72, min_ms: 100.0, max_ms: 400.0 };
         assert!((rate.hz - expected.hz).abs() < 1e-6 && (rate.jitter_ms - expected.jitter_ms).abs() < 0.01);

@@ -219,7 +219,7 @@ fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
         topic: &'static str,
         received: u64,
         before: u64,
-        ahead: u64,
+        in_future: u64,
         flags: Vec<&'static str>,
         age: Option<Quantiles>,
         line: Option<Quantiles>,
@@ -235,7 +235,7 @@ fn result<'a>(name: &'a TopicName, spans: &Spans) -> impl Serialize + 'a {
         topic: name.topic.name(),
         received: spans.received,
         before: spans.before,
-        ahead: spans.ahead,
+        in_future: spans.in_future,
         flags: Flags::names(spans.flags).collect(),
         age: of(Span::Age),
         line: of(Span::Line),
@@ -298,9 +298,11 @@ fn remarks(name: &TopicName, spans: &Spans) -> Vec<String> {
             "{name}: the network's time is measured with the wall clocks of two machines, and contains their difference"
         ));
     }
-    if spans.ahead > 0 {
-        remarks
-            .push(format!("{name}: {} have stamps ahead of the clock here: the clocks differ", spans.ahead));
+    if spans.in_future > 0 {
+        remarks.push(format!(
+            "{name}: {} have stamps ahead of the clock here: the clocks differ",
+            spans.in_future
+        ));
     }
     let kinds: Vec<_> = Flags::names(spans.flags).filter(|flag| *flag != "remote").collect();
     if !kinds.is_empty() {
@@ -480,7 +482,7 @@ mod tests {
     fn writes_result_as_object() {
         let (name, spans) = measured();
         let line = serde_json::to_string(&result(&name, &spans)).expect("an object");
-        let begin = r#"{"class":"latency","sensor":"front","topic":"scan","received":4,"before":1,"ahead":0,"flags":["simulated"],"age":{"count":3,"min_ns":1500,"p50_ns":1600,"p90_ns":15000,"p99_ns":15000,"p999_ns":15000,"max_ns":15000},"line":{"count":3,"#;
+        let begin = r#"{"class":"latency","sensor":"front","topic":"scan","received":4,"before":1,"in_future":0,"flags":["simulated"],"age":{"count":3,"min_ns":1500,"p50_ns":1600,"p90_ns":15000,"p99_ns":15000,"p999_ns":15000,"max_ns":15000},"line":{"count":3,"#;
         assert!(line.starts_with(begin), "{line}");
         assert!(line.contains(r#""hub":{"count":3,"min_ns":512,"p50_ns":512,"#), "{line}");
         assert!(line.ends_with(r#","network":null}"#), "{line}");

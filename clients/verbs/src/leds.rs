@@ -196,13 +196,13 @@ impl Board<'_> {
     fn report(&mut self, light: Light, name: &str, news: News) -> Result<(), End> {
         let (state, failure) = match news {
             News::Failed(failure) => ("failed", Some(failure)),
-            News::Back => ("back", None),
+            News::Back => ("recovered", None),
         };
         if self.look == Look::Json {
             let (message, hint) = failure.map(|it| (it.message, it.hint)).unzip();
             return self.out.json(&Led { class: "led", light: light.name(), name, state, message, hint });
         }
-        self.note(&failure.map_or(format!("{name} is back"), |failure| failure.to_string()))
+        self.note(&failure.map_or(format!("{name} has recovered"), |failure| failure.to_string()))
     }
 
     /// Writes a line to `notes`. The lights are redrawn below it.

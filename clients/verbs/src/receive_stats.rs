@@ -11,7 +11,7 @@ pub struct ReceiveStats {
     /// Samples received.
     pub(crate) received: u64,
     /// Samples sent meanwhile and not received: missing numbers.
-    pub(crate) lost: u64,
+    pub(crate) missed: u64,
     /// Number of samples received as they were sent, and the time of the first of them.
     live: Option<(u64, Instant)>,
     /// Losses on the sensor's line in the run, if its statuses are followed.
@@ -28,7 +28,7 @@ impl ReceiveStats {
         ReceiveStats {
             topic,
             received: 0,
-            lost: 0,
+            missed: 0,
             live: None,
             loss: Loss::default(),
             first: None,
@@ -45,7 +45,7 @@ impl ReceiveStats {
         if !is_of_before {
             self.live.get_or_insert((0, now)).0 += 1;
         }
-        self.lost += missed;
+        self.missed += missed;
         self.first.get_or_insert(now);
         self.last = Some(now);
         self.period = Duration::from_micros(period_us.into());
@@ -159,7 +159,7 @@ mod tests {
         for i in 0..5 {
             stats.count(start + Duration::from_millis(500 * i), i, 0, false);
         }
-        assert_eq!((stats.received, stats.lost, stats.seconds(), stats.hz()), (5, 10, 2.0, Some(2.0)));
+        assert_eq!((stats.received, stats.missed, stats.seconds(), stats.hz()), (5, 10, 2.0, Some(2.0)));
         assert!(!stats.stale(start + Duration::from_millis(2900)));
         assert!(stats.stale(start + Duration::from_millis(3000)));
         assert!(!stats.stale(start + Duration::from_millis(9000)));

@@ -54,7 +54,7 @@ pub(crate) fn notice(line: &mut Vec<u8>, names: &[Rc<TopicName>], notice: &Notic
 
 /// The end of a run.
 pub(crate) fn summary(line: &mut Vec<u8>, name: &TopicName, stats: &ReceiveStats) -> io::Result<()> {
-    write!(line, "{name}: {} received, {} lost in {:.1} s", stats.received, stats.lost, stats.seconds())?;
+    write!(line, "{name}: {} received, {} missed in {:.1} s", stats.received, stats.missed, stats.seconds())?;
     if let Some(hz) = stats.hz() {
         write!(line, ", {hz:.2} Hz")?;
     }

@@ -200,7 +200,7 @@ function tellSensors() {
     if (!sensor.card) makeCard(sensor);
     const { card, title, state, kind, trouble, fields } = sensor.card;
     const isHere = isHeard() && robot.hub && sensor.session === session;
-    const word = isHere ? status.state : "unheard";
+    const word = isHere ? status.state : "no status";
     const isLossy = status.loss > WELL;
     card.className = [word, isLossy ? "lossy" : "", shown().includes(sensor) ? "" : "off"].join(" ");
     put(title, `${n + 1}  ${sensor.name}`);

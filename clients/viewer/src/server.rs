@@ -65,7 +65,7 @@ pub struct ViewerEvent {
     /// Whether the viewer connected.
     pub connected: bool,
     /// Number of messages that newer ones replaced before they were sent.
-    pub skipped: u64,
+    pub replaced: u64,
     /// Number of viewers that are connected now.
     pub viewers: usize,
 }
@@ -142,8 +142,8 @@ impl Server {
                 // Report a viewer that disconnected, and a client that became a viewer.
                 if was_viewer == is_closed {
                     viewers = if is_closed { viewers - 1 } else { viewers + 1 };
-                    let skipped = viewer.skipped();
-                    let event = ViewerEvent { address, connected: !is_closed, skipped, viewers };
+                    let replaced = viewer.skipped();
+                    let event = ViewerEvent { address, connected: !is_closed, replaced, viewers };
                     let _ = events.send(Event::Viewer(event));
                 }
             }

@@ -335,26 +335,26 @@ impl Reporter<'_> {
 
     fn viewer(&mut self, event: &ViewerEvent) -> Result<(), End> {
         #[derive(Serialize)]
-        struct Client {
+        struct Viewer {
             class: &'static str,
             address: String,
-            came: bool,
-            skipped: u64,
-            clients: usize,
+            connected: bool,
+            replaced: u64,
+            viewers: usize,
         }
-        let ViewerEvent { address, connected, skipped, viewers } = *event;
-        let word = if connected { "came" } else { "went" };
+        let ViewerEvent { address, connected, replaced, viewers } = *event;
+        let word = if connected { "connected" } else { "disconnected" };
         match self.json {
-            true => self.output.json(&Client {
-                class: "client",
+            true => self.output.json(&Viewer {
+                class: "viewer",
                 address: address.to_string(),
-                came: connected,
-                skipped,
-                clients: viewers,
+                connected,
+                replaced,
+                viewers,
             }),
-            false => {
-                self.output.line(|line| write!(line, "{address} {word}, {viewers} here, {skipped} skipped"))
-            }
+            false => self
+                .output
+                .line(|line| write!(line, "{address} {word}, {viewers} viewers, {replaced} replaced")),
         }
     }
 

@@ -118,7 +118,7 @@ fn readers_get_every_message_despite_a_slow_viewer_and_many_connections() {
             if let Event::Viewer(visit) = skipped()
                 && !visit.connected
             {
-                gone.push(visit.skipped);
+                gone.push(visit.replaced);
             }
         }
         gone.sort_unstable();

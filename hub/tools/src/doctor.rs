@@ -143,7 +143,7 @@ pub const CHECKS: &[&str] = &[
     "memory",
     "domain",
     "hubs",
-    "strangers",
+    "foreign-files",
     "leftovers",
     "descriptors",
     "file-size",

@@ -92,7 +92,7 @@ fn a_queue_is_full() {
         // What waits in it goes with it.
         robot.machine.run("tc qdisc change dev eth0 root tbf rate 1gbit burst 100kb limit 1mb");
         receiver.await_more(20, is_scan);
-        await_link(&mut gateway, "eth0", "well");
+        await_link(&mut gateway, "eth0", "recovered");
         let outcome = gateway.end(TERM);
         let (sent, failed) = sent(&outcome, "eth0");
         // What the kernel took got there, what it did not take was counted: nothing is lost that nobody knows of.
@@ -117,7 +117,7 @@ fn hosts_that_are_not_there_disturb_nobody() {
         assert!(far.heard().is_empty());
         robot.machine.run(&format!("ip route add 10.99.0.0/24 via {here}"));
         far.await_more(20, is_scan);
-        await_link(&mut gateway, no_route, "well");
+        await_link(&mut gateway, no_route, "recovered");
         let outcome = gateway.end(TERM);
         let heard = receiver.finish();
         assert_eq!(account(&heard), sent(&outcome, "eth0"));

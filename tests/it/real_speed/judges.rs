@@ -31,7 +31,7 @@ pub(super) fn all_is_accounted_for(taken: &[Value], outcome: &Outcome) {
     let boots: HashSet<_> = taken.iter().map(|line| line["boot"].as_str()).collect();
     let lives = taken.chunk_by(|one, next| one["boot"] == next["boot"]).count();
     assert_eq!(boots.len(), lives, "a hub's life came back");
-    assert_eq!(taken.len() as u64 + number(summary, "lost"), published, "{summary}");
+    assert_eq!(taken.len() as u64 + number(summary, "missed"), published, "{summary}");
 }
 
 /// Telegrams without a doubt are those that the sensor sent, in its order, each once.
@@ -51,6 +51,6 @@ pub(super) fn nothing_is_lost(taken: &[Value], sent: &[Record], outcome: &Outcom
     let place = |hash| sent.iter().rposition(|record| record.sha256 == hash).expect("was sent");
     let [first, last] = ends.map(place);
     let intact = sent[first..=last].iter().filter(|record| record.fault.is_none()).count();
-    let missed = number(summary, "lost") as usize;
+    let missed = number(summary, "missed") as usize;
     assert!(intact <= CALM + missed, "{intact} came whole, {CALM} were published, {missed} missed");
 }

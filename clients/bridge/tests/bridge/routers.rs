@@ -42,7 +42,7 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
     }
     local.await_line("a scan", |line| line["class"] == "scan");
     let local = local.end(INT);
-    assert_eq!(local.of_class("summary")[0]["lost"], 0, "the hub's own consumers: {local}");
+    assert_eq!(local.of_class("summary")[0]["missed"], 0, "the hub's own consumers: {local}");
     let sent = there.end(INT);
     // The last announcement goes over two routers.
     let announced = account_of_announcements(&sent);

@@ -59,7 +59,7 @@ fn on_a_slow_link_the_newest_comes_first() {
         remote.await_lines(60, "a scan", |line: &Value| line["class"] == "scan");
         local.await_line("a scan", |line| line["class"] == "scan");
         let local = local.end(INT);
-        assert_eq!(local.of_class("summary")[0]["lost"], 0, "{local}");
+        assert_eq!(local.of_class("summary")[0]["missed"], 0, "{local}");
         assert_eq!(hub.end(TERM).code, Some(0));
         let (sent, _) = end_when_all_arrived(there, here);
         let replaced: u64 = account(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();

@@ -113,7 +113,7 @@ pub struct EvictedTotals {
     /// Runs of gateways.
     pub runs: u64,
     /// Runs that were still active and had to make room for others.
-    pub displaced: u64,
+    pub evicted_active: u64,
     /// Distinct sequence numbers that arrived.
     pub received: u64,
     /// Sequence numbers that did not arrive, and cannot arrive any more because their run has ended.
@@ -546,13 +546,13 @@ impl GatewayTable {
     }
 
     /// Removes a run, and adds its counters to the totals.
-    fn end(&mut self, (hub, epoch): RunId, is_displaced: bool) {
+    fn end(&mut self, (hub, epoch): RunId, is_active: bool) {
         let Some(run) = self.gateways.get_mut(&hub).and_then(|gateway| gateway.runs.remove(&epoch)) else {
             return;
         };
         let sum = &mut self.evicted;
         sum.runs += 1;
-        sum.displaced += u64::from(is_displaced);
+        sum.evicted_active += u64::from(is_active);
         for row in run.rows() {
             sum.received += row.received;
             sum.lost += row.lost();
@@ -833,7 +833,7 @@ mod tests {
         assert_eq!(at(&mut table, &zones(head(64, 1, 0)), 4000), Ok(Fresh::New));
         let sum = table.evicted();
         assert_eq!(
-            (sum.runs, sum.displaced, sum.lost),
+            (sum.runs, sum.evicted_active, sum.lost),
             (1, 1, 0),
             "the run that was evicted for the row left a place"
         );
@@ -863,7 +863,7 @@ mod tests {
         }
         assert_eq!(at(&mut table, &zones(head(7777, 1, 0)), 1003), Ok(Fresh::New));
         assert!(knows(&table, 9999, 1) && knows(&table, 7777, 1), "{:?}", table.evicted());
-        assert_eq!(table.evicted().displaced, table.evicted().runs);
+        assert_eq!(table.evicted().evicted_active, table.evicted().runs);
     }
 
     #[test]
@@ -910,7 +910,7 @@ mod tests {
         let rows: Vec<_> = table.rows().map(|row| (row.received, row.lost())).collect();
         assert_eq!(rows, [(1, 0)]);
         let evicted = table.evicted();
-        assert_eq!((evicted.runs, evicted.displaced, evicted.received, evicted.lost), (1, 0, 30, 0));
+        assert_eq!((evicted.runs, evicted.evicted_active, evicted.received, evicted.lost), (1, 0, 30, 0));
         assert_eq!(table.refused(DatagramError::Twin), 1);
     }
 
@@ -966,8 +966,8 @@ mod tests {
         }
         assert!(contains(&table, (2, 5)) && is_over(&table, (1, 8)) && !is_over(&table, (1, 9)));
         let mut evict = || {
-            let displaced = table.evicted().displaced;
-            table.evict((9, 9), announces(0)).map(|run| (run, table.evicted().displaced > displaced))
+            let displaced = table.evicted().evicted_active;
+            table.evict((9, 9), announces(0)).map(|run| (run, table.evicted().evicted_active > displaced))
         };
         let retired = [(2, 5), (1, 5), (2, 6)].map(|run| Some((run, false)));
         assert_eq!([(); 3].map(|()| evict()), retired);

@@ -23,7 +23,7 @@ use crate::lan::{EvictedTotals, GatewayTable, Row};
 pub struct Words {
     row: &'static str,
     refused: &'static str,
-    given_up: &'static str,
+    evicted: &'static str,
     published: &'static str,
     no_room: &'static str,
     /// Whether the counters include samples that senders replaced by newer ones.
@@ -35,7 +35,7 @@ impl Words {
     pub const LAN: Words = Words {
         row: "lan",
         refused: "lan_refused",
-        given_up: "lan_given_up",
+        evicted: "lan_evicted",
         published: "lan_published",
         no_room: "lan_no_room",
         tells_replaced: false,
@@ -44,7 +44,7 @@ impl Words {
     pub const BRIDGE: Words = Words {
         row: "bridge",
         refused: "bridge_refused",
-        given_up: "bridge_given_up",
+        evicted: "bridge_evicted",
         published: "bridge_published",
         no_room: "bridge_no_room",
         tells_replaced: true,
@@ -221,7 +221,7 @@ impl<'a> Report<'a> {
                 replaced: self.words.tells_replaced.then_some(replaced),
             })?;
         }
-        self.out.json(&Sums::new(gateways.evicted(), self.words.given_up))?;
+        self.out.json(&Sums::new(gateways.evicted(), self.words.evicted))?;
         self.out.json(&Refused { class: self.words.refused, reasons: Reasons { gateways, others } })
     }
 
@@ -245,9 +245,9 @@ impl<'a> Report<'a> {
             cells
         }));
         table(&mut self.out, &rows)?;
-        let given_up = gateways.evicted();
-        if given_up.runs > 0 {
-            self.out.line(|line| Sums::new(given_up, self.words.given_up).text(line))?;
+        let evicted = gateways.evicted();
+        if evicted.runs > 0 {
+            self.out.line(|line| Sums::new(evicted, self.words.evicted).text(line))?;
         }
         self.out.line(|line| {
             write!(line, "refused:")?;
@@ -443,12 +443,12 @@ impl<'a> Published<'a> {
     }
 }
 
-/// Class `lan_given_up` or `bridge_given_up`.
+/// Class `lan_evicted` or `bridge_evicted`.
 #[derive(Serialize)]
 struct Sums {
     class: &'static str,
-    lives: u64,
-    displaced: u64,
+    runs: u64,
+    evicted_active: u64,
     received: u64,
     lost: u64,
     duplicate: u64,
@@ -457,18 +457,17 @@ struct Sums {
 }
 
 impl Sums {
-    fn new(given_up: EvictedTotals, class: &'static str) -> Sums {
-        let EvictedTotals { runs: lives, displaced, received, lost, duplicate, reordered, no_room } =
-            given_up;
-        Sums { class, lives, displaced, received, lost, duplicate, reordered, no_room }
+    fn new(evicted: EvictedTotals, class: &'static str) -> Sums {
+        let EvictedTotals { runs, evicted_active, received, lost, duplicate, reordered, no_room } = evicted;
+        Sums { class, runs, evicted_active, received, lost, duplicate, reordered, no_room }
     }
 
     /// Writes the counters as text.
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Sums { lives, displaced, received, lost, duplicate, reordered, no_room, .. } = self;
+        let Sums { runs, evicted_active, received, lost, duplicate, reordered, no_room, .. } = self;
         write!(
             line,
-            "of {lives} former starts of gateways together, {displaced} of them given up for others: "
+            "of {runs} evicted runs of gateways together, {evicted_active} of which had not ended: "
         )?;
         write!(line, "received {received}, lost {lost}, ")?;
         write!(line, "duplicate {duplicate}, reordered {reordered}")?;

@@ -47,7 +47,7 @@ fn main() -> Result<(), scanhub_schema::Failure> {
     }
     if is_wanted("faults") {
         println!(
-            "fault from 20 to 24 s: beams points_dropped (silent, jumped, inconsistent, standing), sweeps unreliable of all"
+            "fault from 20 to 24 s: beams dropped (silent, jumped, inconsistent, standing), sweeps unreliable of all"
         );
         println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
         for (name, kind) in FAULTS {

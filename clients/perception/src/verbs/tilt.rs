@@ -437,7 +437,7 @@ impl Line<'_> {
                     "{sweeps} sweeps ({incomplete} incomplete, {unreliable} unreliable) of {scans} scans, "
                 )?;
                 let [silent, jumped, inconsistent, standing] = counts.points_dropped;
-                write!(out, "{points} points; points_dropped: {silent} without an angle, {jumped} jumped, ")?;
+                write!(out, "{points} points; beams dropped: {silent} without an angle, {jumped} jumped, ")?;
                 write!(out, "{inconsistent} inconsistent, {standing} standing; {angles} angles; dropped: ")?;
                 let Counts { angles_out_of_order, angles_in_future, angles_invalid, .. } = counts;
                 write!(

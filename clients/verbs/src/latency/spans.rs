@@ -51,7 +51,7 @@ pub(super) struct Spans {
     /// first ones of a new hub.
     pub(super) before: u64,
     /// Samples with stamps ahead of the clock of this machine, for example by the wall clock of another one.
-    pub(super) ahead: u64,
+    pub(super) in_future: u64,
     /// Bits of [`Flags`] that any sample had.
     pub(super) flags: u8,
     ages: [Ages; Span::ALL.len()],
@@ -60,7 +60,7 @@ pub(super) struct Spans {
 impl Spans {
     pub(super) fn new() -> Spans {
         let ages = Span::ALL.map(|_| Ages::new());
-        Spans { since_ns: u64::MAX, received: 0, before: 0, ahead: 0, flags: 0, ages }
+        Spans { since_ns: u64::MAX, received: 0, before: 0, in_future: 0, flags: 0, ages }
     }
 
     /// Does not measure samples that were sent before `now_ns` of CLOCK_MONOTONIC.
@@ -81,7 +81,7 @@ impl Spans {
             return;
         }
         let Some(age_ns) = seen.monotonic_ns.checked_sub(header.stamp_last_ns) else {
-            self.ahead += 1;
+            self.in_future += 1;
             return;
         };
         self.record(Span::Age, age_ns);
@@ -99,7 +99,7 @@ impl Spans {
                     self.record(Span::Network, network_ns);
                     self.record(Span::Total, network_ns.saturating_add(age_ns));
                 }
-                None => self.ahead += 1,
+                None => self.in_future += 1,
             }
         } else if is_from_telegram(header) {
             let line_ns = header.stamp_last_ns - header.stamp_first_ns;
@@ -255,7 +255,7 @@ mod tests {
         assert!(parts[0].1.abs_diff(15_000) <= 15, "{parts:?}");
         assert_eq!((parts[1].1, parts[2].1, parts[3].1), (40, 31, 72), "256 ns are the hub's unit");
         assert!(parts[4].1.abs_diff(15_072) <= 15, "{parts:?}");
-        assert_eq!((spans.received, spans.before, spans.ahead, spans.flags), (1, 0, 0, Flags::SIMULATED));
+        assert_eq!((spans.received, spans.before, spans.in_future, spans.flags), (1, 0, 0, Flags::SIMULATED));
     }
 
     #[test]
@@ -292,7 +292,7 @@ mod tests {
         let mut spans = begun();
         let header = header(2_000_000 * US);
         spans.take(&header, Arrival { monotonic_ns: header.stamp_last_ns - 1, wall_ns: 0 });
-        assert_eq!((spans.ahead, told(&spans).len()), (1, 0));
+        assert_eq!((spans.in_future, told(&spans).len()), (1, 0));
         spans.take(&header, seen(&header, 10));
         let parts = told(&spans);
         assert_eq!((parts[1], parts[2]), (("hub", 0, 1), ("wake", 0, 1)), "never more than the age");
@@ -315,13 +315,13 @@ mod tests {
         assert_eq!(parts, [("network", 1_000, 1), ("age", 50, 1), ("total", 1_050, 1)]);
         // Its wall clock is ahead: the stretch here is known all the same.
         spans.take(&remote(9_001_000 * US), seen);
-        assert_eq!((spans.ahead, told(&spans)[1]), (1, ("age", 50, 2)));
+        assert_eq!((spans.in_future, told(&spans)[1]), (1, ("age", 50, 2)));
         assert_eq!((told(&spans)[0].2, told(&spans)[2].2), (1, 1));
         // Said here, when nothing came.
         for wall_ns in [9_000_000 * US - 300, 9_000_000 * US + 300] {
             spans.take(&remote(wall_ns), seen);
         }
-        assert_eq!((spans.ahead, told(&spans)[0].2, told(&spans)[1].2), (1, 1, 4));
+        assert_eq!((spans.in_future, told(&spans)[0].2, told(&spans)[1].2), (1, 1, 4));
     }
 
     fn of(times: impl IntoIterator<Item = u64>) -> Ages {

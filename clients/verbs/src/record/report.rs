@@ -50,9 +50,9 @@ pub(super) struct Report<'a> {
     /// Bytes in the last report of progress.
     bytes: u64,
     /// Samples that were sent and not received.
-    lost: u64,
+    missed: u64,
     /// Samples whose file was removed or cut.
-    gone: u64,
+    removed: u64,
     is_in_trouble: bool,
 }
 
@@ -78,8 +78,8 @@ impl<'a> Report<'a> {
             next: now + EVERY,
             files: Vec::new(),
             bytes: 0,
-            lost: 0,
-            gone: 0,
+            missed: 0,
+            removed: 0,
             is_in_trouble: false,
         }
     }
@@ -104,7 +104,7 @@ impl<'a> Report<'a> {
     /// Reports news of the hub, and missed samples.
     pub(super) fn hub(&mut self, names: &[Rc<TopicName>], notice: Notice) -> Result<(), End> {
         if let Notice::Missed(missed) = notice {
-            self.lost += missed;
+            self.missed += missed;
         }
         if self.look == Look::Json {
             return json::notices(&mut self.out, names, &notice);
@@ -121,7 +121,7 @@ impl<'a> Report<'a> {
         };
         match news {
             News::File(path) => self.files.push(path.clone()),
-            News::Gone(_, samples) => self.gone += samples,
+            News::Gone(_, samples) => self.removed += samples,
             _ => {}
         }
         if self.look == Look::Json {
@@ -135,11 +135,11 @@ impl<'a> Report<'a> {
             };
             let notice = match news {
                 News::File(path) => of("file", path),
-                News::Trouble(path, message) => Disk { message: Some(message), ..of("disk_trouble", path) },
+                News::Trouble(path, message) => Disk { message: Some(message), ..of("write_failed", path) },
                 News::Well(path, after) => {
-                    Disk { seconds: Some(after.as_secs_f64()), ..of("disk_well", path) }
+                    Disk { seconds: Some(after.as_secs_f64()), ..of("write_resumed", path) }
                 }
-                News::Gone(path, samples) => Disk { samples: Some(*samples), ..of("file_gone", path) },
+                News::Gone(path, samples) => Disk { samples: Some(*samples), ..of("file_removed", path) },
                 News::ReaderGone => return Ok(()),
             };
             return self.out.json(&notice);
@@ -157,7 +157,7 @@ impl<'a> Report<'a> {
                 write!(line, "{} is written again, after {:.1} s", path.display(), after.as_secs_f64())
             }
             News::Gone(path, samples) => {
-                write!(line, "{} was removed or cut: its {samples} samples are gone", path.display())
+                write!(line, "{} was removed or cut: its {samples} samples are lost", path.display())
             }
             News::ReaderGone => Ok(()),
         })
@@ -229,14 +229,14 @@ impl<'a> Report<'a> {
                 files: self.files.iter().map(|file| file.display().to_string()).collect(),
                 bytes,
                 samples,
-                lost: self.lost,
+                missed: self.missed,
                 dropped,
-                gone: self.gone,
+                removed: self.removed,
                 seconds: self.begun.elapsed().as_secs_f64(),
             });
         }
         self.wipe()?;
-        let gone = self.gone;
+        let removed = self.removed;
         let files = &self.files;
         self.out.line(|line| {
             match &files[..] {
@@ -250,7 +250,7 @@ impl<'a> Report<'a> {
             if dropped > 0 {
                 write!(line, ", {dropped} dropped")?;
             }
-            if gone > 0 { write!(line, ", {gone} gone with files that were removed or cut") } else { Ok(()) }
+            if removed > 0 { write!(line, ", {removed} in files that were removed or cut") } else { Ok(()) }
         })
     }
 
@@ -260,7 +260,7 @@ impl<'a> Report<'a> {
             file: self.files.last().map(|file| file.display().to_string()),
             bytes: written.bytes,
             samples: written.samples,
-            lost: self.lost,
+            missed: self.missed,
             dropped,
             seconds: self.begun.elapsed().as_secs_f64(),
             older_removed: None,
@@ -277,7 +277,7 @@ impl<'a> Report<'a> {
             (1, size(written.bytes)),
             (0, format!("{}/s", size(rate))),
             (2, format!("{} samples", written.samples)),
-            (5, format!("{} lost", self.lost + dropped + self.gone)),
+            (5, format!("{} lost", self.missed + dropped + self.removed)),
         ];
         trouble.into_iter().chain(parts).collect()
     }
@@ -312,7 +312,7 @@ struct Progress {
     file: Option<String>,
     bytes: u64,
     samples: u64,
-    lost: u64,
+    missed: u64,
     dropped: u64,
     seconds: f64,
     /// Only in the first line.
@@ -327,9 +327,9 @@ struct Recorded {
     files: Vec<String>,
     bytes: u64,
     samples: u64,
-    lost: u64,
+    missed: u64,
     dropped: u64,
-    gone: u64,
+    removed: u64,
     seconds: f64,
 }
 

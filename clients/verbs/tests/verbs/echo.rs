@@ -69,7 +69,7 @@ fn scans_as_json() {
         ]
     );
     let summary = out.lines().last().unwrap();
-    let begin = r#"{"class":"summary","sensor":"front","topic":"scan","received":2,"lost":0,"seconds":"#;
+    let begin = r#"{"class":"summary","sensor":"front","topic":"scan","received":2,"missed":0,"seconds":"#;
     assert!(summary.starts_with(begin) && summary.contains(r#","hz":"#), "{summary}");
 }
 
@@ -119,7 +119,7 @@ fn scans_as_columns_and_as_bytes() {
             "1,1,1000000001,1700000000000000001,clean,10000,-90,0.5,5,6",
         ]
     );
-    assert!(notes.starts_with("front/scan: 2 received, 0 lost"), "{notes}");
+    assert!(notes.starts_with("front/scan: 2 received, 0 missed"), "{notes}");
     crate::fake::until("bytes", || raw.finished());
     let bytes = raw.out.bytes();
     // The head up to the unit, unit, count, the greatest range and the code above it; the ranges behind the head.
@@ -160,7 +160,7 @@ fn a_gap_in_the_numbers_is_missed() {
     let (_, out, _) = verb.join();
     let lines: Vec<_> = out.lines().collect();
     assert_eq!(lines[1], r#"{"class":"notice","kind":"missed","sensor":"front","topic":"scan","missed":3}"#);
-    assert!(lines[3].contains(r#""received":2,"lost":3"#), "{out}");
+    assert!(lines[3].contains(r#""received":2,"missed":3"#), "{out}");
 }
 
 #[test]
@@ -180,7 +180,7 @@ fn several_sensors_wake_one_echo() {
     assert_eq!(end, Ok(()));
     for sensor in ["front", "rear"] {
         let summary =
-            format!(r#""class":"summary","sensor":"{sensor}","topic":"scan","received":20,"lost":0"#);
+            format!(r#""class":"summary","sensor":"{sensor}","topic":"scan","received":20,"missed":0"#);
         assert!(out.contains(&summary), "{out}");
     }
 }

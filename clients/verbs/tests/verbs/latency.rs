@@ -109,7 +109,7 @@ fn as_text() {
         notes.starts_with("wait by doorbell, normal priority, memory not locked; the clock takes "),
         "{notes}"
     );
-    assert!(out.starts_with("front/zones: 20 received, 0 lost in "), "{out}");
+    assert!(out.starts_with("front/zones: 20 received, 0 missed in "), "{out}");
     assert!(out.contains("\nus   count  ") && out.contains("\nage "), "{out}");
     assert!(out.contains(" us ") && out.contains(" ##"), "no bars: {out}");
 }

@@ -64,7 +64,7 @@ fn echo_goes_on_after_a_killed_hub() {
     // The consumer was there all the time: it got the new hub's samples from the first on.
     let first = out.lines().find(|line| line.contains(r#""boot":"0000000000000002""#)).unwrap();
     assert!(first.contains(r#""topic_seq":0,"#), "{first}");
-    assert!(out.lines().last().unwrap().contains(r#""lost":0"#), "{out}");
+    assert!(out.lines().last().unwrap().contains(r#""missed":0"#), "{out}");
     hub.kill(&place);
 }
 

@@ -148,7 +148,7 @@ fn rates_of_all_topics() {
         line.split("\"").skip(1).step_by(2).filter(|it| !["hz", "front", "scan"].contains(it)).collect();
     assert_eq!(
         keys.join(" "),
-        "class sensor topic jitter_ms min_ms max_ms received lost window_s damaged lost_on_line",
+        "class sensor topic jitter_ms min_ms max_ms received missed window_s damaged lost_on_line",
         "{line}"
     );
     assert!(

@@ -116,7 +116,7 @@ fn echo_says_the_silence_too() {
     let silence = r#"{"class":"zones","sensor":"front","seq":null,"topic_seq":null,"stamp_ns":null,"wall_ns":null,"boot":null,"quality":null,"verdict":"unknown","nearest_mm":null,"nearest_beam":null,"zones":[],"invalid_beams":0,"stale":true}"#;
     assert_eq!(lines[1], silence);
     assert!(
-        lines[2].contains(r#""class":"summary""#) && lines[2].contains(r#""received":1,"lost":0"#),
+        lines[2].contains(r#""class":"summary""#) && lines[2].contains(r#""received":1,"missed":0"#),
         "{out}"
     );
     let (_, out, _) = text.join();
@@ -124,7 +124,7 @@ fn echo_says_the_silence_too() {
     let bytes = raw.out.bytes();
     assert_eq!((bytes[0], bytes[76]), (Verdict::Stop as u8, Verdict::Unknown as u8));
     let (_, out, _) = rate.join();
-    assert!(out.lines().last().is_some_and(|line| line.contains(r#""received":1,"lost":0"#)), "{out}");
+    assert!(out.lines().last().is_some_and(|line| line.contains(r#""received":1,"missed":0"#)), "{out}");
 }
 
 #[test]
@@ -183,8 +183,11 @@ fn echo_of_the_robot() {
     hub.sensors[0].zones(Verdict::Stop, 300);
     let (end, out, _) = verb.join();
     assert_eq!(end, Ok(()));
-    assert!(out.lines().all(|line| line.starts_with(r#"{"class":"zones","sensor":"robot","stamp_ns":"#)
-        || line.starts_with(r#"{"class":"summary","sensor":"robot","topic":"zones","received":3,"lost":0"#)));
+    assert!(out.lines().all(|line| {
+        line.starts_with(r#"{"class":"zones","sensor":"robot","stamp_ns":"#)
+            || line
+                .starts_with(r#"{"class":"summary","sensor":"robot","topic":"zones","received":3,"missed":0"#)
+    }));
     let told = r#""verdict":"stop","nearest_mm":300,"nearest_sensor":"rear","sensors":[{"sensor":"front","verdict":"unknown"},{"sensor":"rear","verdict":"stop"}]}"#;
     assert!(out.lines().nth_back(1).is_some_and(|line| line.ends_with(told)), "{out}");
 }

@@ -120,7 +120,7 @@ impl Sensor {
     /// Returns the state of the link for people.
     pub fn state(&self) -> &'static str {
         match self.status.map(|status| status.state()) {
-            None => "unheard",
+            None => "no status",
             Some(state) => state.map_or("unknown", State::name),
         }
     }

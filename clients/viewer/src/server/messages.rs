@@ -308,7 +308,7 @@ mod tests {
         assert_eq!((&told["verdict"], &told["hub"]), (&"unknown".into(), &false.into()));
         assert_eq!((&told["hub_words"], &told["people"]), (&"no hub".into(), &serde_json::Value::Null));
         let told = object(status(scene.sensor("front")));
-        assert_eq!((&told["state"], &told["hz"]), (&"unheard".into(), &serde_json::Value::Null));
+        assert_eq!((&told["state"], &told["hz"]), (&"no status".into(), &serde_json::Value::Null));
         assert_eq!(told["pose"], serde_json::Value::Null, "its pose is unknown");
         assert_eq!(told["trouble"]["what"], "nothing was heard of it yet");
     }

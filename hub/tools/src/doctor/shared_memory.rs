@@ -184,7 +184,7 @@ const MAX_NAMED: usize = 4;
 
 /// Checks whether files of other users exist; `name_of` returns the name of their owner.
 pub(crate) fn strangers(found: &[Segment], name_of: impl Fn(u32) -> String) -> Finding {
-    const NAME: &str = "strangers";
+    const NAME: &str = "foreign-files";
     if found.is_empty() {
         return Finding::ok(NAME, "no file of another user under the domain's names");
     }

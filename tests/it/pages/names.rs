@@ -1,0 +1,135 @@
+//! Public names that misled, and have other names now: no key of a line of JSON or of the configuration, and no flag has one
+//! of them again.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use crate::testkit::TestEnv;
+
+/// Words that are not used as names, each with the places where it has another meaning: rows of `docs/output.md` by
+/// `CLASS VERB`.
+const FORBIDDEN: [(&str, &[&str]); 36] = [
+    ("self_min", &[]),
+    ("i_min", &[]),
+    ("polish", &[]),
+    ("consumers", &[]),
+    ("breaks", &[]),
+    ("collapsed", &[]),
+    ("taught", &[]),
+    ("doubted", &[]),
+    ("left_out", &[]),
+    ("unordered", &[]),
+    ("angles_unordered", &[]),
+    ("angles_ahead", &[]),
+    ("ahead", &[]),
+    ("withheld", &[]),
+    ("forgotten", &[]),
+    ("unfit", &[]),
+    ("angles_unfit", &[]),
+    ("pictures", &[]),
+    ("trouble", &[]),
+    // Telegrams and datagrams that did not arrive, and the reason of a verdict.
+    ("lost", &["summary demo", "lan listen", "lan_evicted listen", "bridge bridge", "leds leds"]),
+    ("lan_given_up", &[]),
+    ("bridge_given_up", &[]),
+    ("lives", &[]),
+    ("displaced", &[]),
+    ("unasked", &[]),
+    ("disk_trouble", &[]),
+    ("disk_well", &[]),
+    ("file_gone", &[]),
+    ("gone", &[]),
+    ("client", &[]),
+    ("came", &[]),
+    ("clients", &[]),
+    // A check that was not made, and a topic that the receiver does not know.
+    ("skipped", &["check doctor", "tilt_check tilt --check", "lan_refused listen"]),
+    ("well", &[]),
+    // People who went through a door.
+    ("back", &["count track --count DOOR", "summary track"]),
+    ("unheard", &[]),
+];
+
+/// A name, and where it is used.
+type Used = (String, String);
+
+/// Returns the names among `used` that are forbidden where they are used.
+fn forbidden(used: &[Used]) -> Vec<String> {
+    let is_forbidden = |(place, name): &&Used| {
+        FORBIDDEN.iter().any(|(word, allowed)| word == name && !allowed.contains(&place.as_str()))
+    };
+    used.iter().filter(is_forbidden).map(|(place, name)| format!("{place}: {name}")).collect()
+}
+
+/// Returns the classes and keys in the tables of `page`, which has the form of `docs/output.md`.
+fn of_output(page: &str) -> Vec<Used> {
+    let mut used = Vec::new();
+    for row in page.lines().filter(|row| row.starts_with("| `")) {
+        let quoted = |cell: &str| cell.split('`').skip(1).step_by(2).map(str::to_owned).collect::<Vec<_>>();
+        let mut cells = row.split(" | ");
+        let [classes, verbs] = [(); 2].map(|()| quoted(cells.next().unwrap_or_default()));
+        let keys: Vec<_> = cells.flat_map(quoted).collect();
+        let keys: Vec<_> = keys.iter().flat_map(|key| key.split_whitespace()).collect();
+        for class in &classes {
+            let place = format!("{class} {}", verbs.first().map_or("", String::as_str));
+            let words = keys.iter().copied().chain([class.as_str()]);
+            used.extend(words.map(|word| (place.clone(), word.to_owned())));
+        }
+    }
+    used
+}
+
+/// Returns the keys of the configuration.
+fn of_configuration() -> Vec<Used> {
+    let keys = scanhub_config::keys().into_iter();
+    keys.flat_map(|(section, keys)| {
+        keys.into_iter().map(move |(key, _)| (section.to_owned(), key.name.to_owned()))
+    })
+    .collect()
+}
+
+/// Returns the flags in the help of all verbs.
+fn of_help(env: &TestEnv) -> Vec<Used> {
+    let help = |arguments: &[&str]| {
+        let outcome = env.run(arguments);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        String::from_utf8(outcome.out).expect("text")
+    };
+    let all = help(&["--help"]);
+    let rows = all.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|row| !row.is_empty());
+    let verbs: BTreeSet<_> = rows.filter_map(|row| row.split_whitespace().next()).collect();
+    // The bridge is another program, whose own test holds its flags.
+    let verbs = verbs.into_iter().filter(|verb| !["help", "bridge"].contains(verb));
+    let mut used = Vec::new();
+    for verb in verbs {
+        let text = help(&[verb, "--help"]);
+        let words = text.split(|c: char| c.is_whitespace() || "[]=,;".contains(c));
+        let flags = words.filter_map(|word| word.strip_prefix("--")).filter(|flag| !flag.is_empty());
+        used.extend(flags.map(|flag| (verb.to_owned(), flag.replace('-', "_"))));
+    }
+    used
+}
+
+#[test]
+fn no_public_name_is_forbidden() {
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/output.md");
+    let output = of_output(&fs::read_to_string(page).expect("the page"));
+    for (word, places) in FORBIDDEN {
+        let is_used = |place: &&&str| output.iter().any(|(used, name)| used == *place && name == word);
+        assert_eq!(places.iter().find(|place| !is_used(place)), None, "{word} is not there any more");
+    }
+    let (keys, flags) = (of_configuration(), of_help(&TestEnv::new()));
+    for (used, name) in [(&output, "topic_seq"), (&keys, "body_mask"), (&flags, "subscribers")] {
+        assert!(used.iter().any(|(_, known)| known == name), "no {name} in {used:?}");
+    }
+    assert_eq!(forbidden(&[output, keys, flags].concat()), Vec::<String>::new());
+}
+
+#[test]
+fn finds_a_forbidden_name() {
+    let row = "| `hz` | `hz` | `sensor topic hz received lost` (samples), `lost_on_line` |\n\
+               | `lan` | `listen` | `received lost` |\n";
+    assert_eq!(forbidden(&of_output(row)), ["hz hz: lost"]);
+    assert_eq!(forbidden(&[("zones".to_owned(), "self_min".to_owned())]), ["zones: self_min"]);
+}
