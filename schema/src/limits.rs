@@ -23,7 +23,7 @@ pub struct TopicLimits {
 }
 
 impl TopicLimits {
-    /// How many subscribers a topic can be made for. The event that wakes them has no more places.
+    /// Numbers of subscribers that a topic can be created for. The event that wakes them has no more places.
     pub const SUBSCRIBERS: RangeInclusive<usize> = 1..=LISTENERS;
 
     /// Refuses what cannot be.
@@ -76,7 +76,7 @@ pub const fn buffer(topic: Topic) -> usize {
     topic.row().waiting
 }
 
-/// Returns the number of samples that a subscriber of `topic` gets which comes later.
+/// Returns the number of samples of `topic` that a late joiner receives.
 pub const fn history(topic: Topic) -> usize {
     topic.row().kept
 }

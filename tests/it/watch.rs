@@ -185,7 +185,7 @@ fn a_demonstration_shows_it() {
     demo.await_words("2 rear     streaming");
     let (code, below, is_whole) = demo.end();
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
-    assert_eq!(below.matches(" 0 missed in ").count(), 2, "{below:?}");
+    assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
     assert_eq!(std::fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
     assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
 }
@@ -244,5 +244,5 @@ fn in_tmux_it_is_what_it_is_elsewhere() {
     // Before its time was over.
     let rows = tmux.await_rows("end", |rows| rows.iter().any(|row| row == "ended with 130"));
     assert!(!is_picture(&rows), "the picture is left:\n{}", rows.join("\n"));
-    assert_eq!(rows.iter().filter(|row| row.contains(" 0 missed in ")).count(), 2, "{}", rows.join("\n"));
+    assert_eq!(rows.iter().filter(|row| row.contains(" 0 lost in ")).count(), 2, "{}", rows.join("\n"));
 }

@@ -129,7 +129,7 @@ fn page_drops_sensors_of_previous_server() {
     page.await_true("/No connection/.test(scanhub.reason)");
     let (server, _) = web(&second, &address);
     let states = "[...document.querySelectorAll('#sensors article')].map((one) => one.classList[0]).join()";
-    page.await_true(&format!("{titles} === '1  front,2  rear' && {states} === 'no status,streaming'"));
+    page.await_true(&format!("{titles} === '1  front,2  rear' && {states} === 'no-status,streaming'"));
     assert!(page.ask("scanhub.beams").as_u64() > Some(100));
     page.press(" ");
     page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));

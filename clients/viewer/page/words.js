@@ -202,7 +202,7 @@ function tellSensors() {
     const isHere = isHeard() && robot.hub && sensor.session === session;
     const word = isHere ? status.state : "no status";
     const isLossy = status.loss > WELL;
-    card.className = [word, isLossy ? "lossy" : "", shown().includes(sensor) ? "" : "off"].join(" ");
+    card.className = [word.replace(" ", "-"), isLossy ? "lossy" : "", shown().includes(sensor) ? "" : "off"].join(" ");
     put(title, `${n + 1}  ${sensor.name}`);
     press(title, only === sensor.space);
     put(state, word + (status.frozen ? ", frozen" : ""));

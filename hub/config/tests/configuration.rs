@@ -353,7 +353,7 @@ fn old_names_are_errors_that_state_the_new_names() {
         ("[limits]\nconsumers = 40", "limits.subscribers"),
         ("[link.zones]\nself_min = []", "zones.body_mask"),
     ] {
-        let file = Scratch::new("old.toml", &format!("[[link]]\nname = \"a\"\nport = \"x\"\n{old}\n"));
+        let file = Scratch::new("old.toml", format!("[[link]]\nname = \"a\"\nport = \"x\"\n{old}\n"));
         let error = load(&[&file], &[]).unwrap_err();
         let key = old.split(['\n', ' ']).nth(1).unwrap();
         let expected = format!("old.toml:5:1: unknown key `{key}`\n  its new name is `{new}`");

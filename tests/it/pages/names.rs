@@ -1,5 +1,5 @@
-//! Public names that misled, and have other names now: no key of a line of JSON or of the configuration, and no flag has one
-//! of them again.
+//! Checks that no JSON key, configuration key or flag has one of the old public names. They misled, or contradicted the
+//! glossary.
 
 use std::collections::BTreeSet;
 use std::fs;

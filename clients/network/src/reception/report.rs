@@ -465,10 +465,7 @@ impl Sums {
     /// Writes the counters as text.
     fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
         let Sums { runs, evicted_active, received, lost, duplicate, reordered, no_room, .. } = self;
-        write!(
-            line,
-            "of {runs} evicted runs of gateways together, {evicted_active} of which had not ended: "
-        )?;
+        write!(line, "{runs} runs of gateways were evicted, {evicted_active} before their end: ")?;
         write!(line, "received {received}, lost {lost}, ")?;
         write!(line, "duplicate {duplicate}, reordered {reordered}")?;
         if *no_room > 0 { write!(line, ", {no_room} beyond --memory") } else { Ok(()) }

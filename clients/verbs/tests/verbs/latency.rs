@@ -53,7 +53,8 @@ fn each_wait_tells_ages() {
         assert!(out.lines().next().is_some_and(|line| line.ends_with(r#","refused":[]}"#)), "{out}");
         let line = told(&out, "zones");
         assert!(
-            line.contains(r#""received":40,"#) && line.contains(r#""ahead":0,"flags":[],"age":{"count":"#)
+            line.contains(r#""received":40,"#)
+                && line.contains(r#""in_future":0,"flags":[],"age":{"count":"#)
         );
         assert!(
             line.ends_with(r#""line":null,"hub":null,"wake":null,"total":null,"network":null}"#),
@@ -96,7 +97,7 @@ fn what_was_sent_before_is_no_latency() {
     assert_eq!((failure.kind, failure.kind.exit_code()), (Kind::Check, 5));
     assert!(failure.message.contains("no sample with a known age arrived"), "{failure}");
     let line = told(&out, "scan");
-    assert!(line.contains(r#""received":5,"before":5,"ahead":0,"flags":[],"age":null,"#), "{line}");
+    assert!(line.contains(r#""received":5,"before":5,"in_future":0,"flags":[],"age":null,"#), "{line}");
     assert_eq!(out.matches(r#""class":"summary""#).count(), 1, "a topic that is named twice is one");
 }
 
